@@ -130,7 +130,7 @@ def tube(config: Config) -> tuple[Any, Any]:
         found = prover.follow(cell)
         first = np.searchsorted(grid, found.time[:, 0])
         last = np.searchsorted(grid, found.time[:, 1], side="right")
-        for a, b, x, y in zip(first, last, found.least[:, 0], found.greatest[:, 0], strict=True):
+        for a, b, x, y in zip(first, last, found.lower[:, 0], found.upper[:, 0], strict=True):
             least[a:b], greatest[a:b] = np.minimum(least[a:b], x), np.maximum(greatest[a:b], y)
     masses = np.random.default_rng(0).uniform(*config.mass, config.runs)
     solver = d.FixedStep(1e-4, config.shown, every=10)

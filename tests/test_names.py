@@ -27,6 +27,10 @@ IRREGULAR = {
     *("given", "taken", "seen", "drawn", "known", "shown", "told", "made", "found", "kept", "said", "held", "sent"),
     *("lent", "built", "left", "chosen", "written", "broken"),
 }
+FILLERS = {
+    *("found", "one", "given", "chosen", "seen", "kept", "asked", "known", "wanted", "there", "off", "most", "least"),
+    *("fine", "left", "mine", "own", "which"),
+}
 
 
 def homes(kind, trees=TREES):
@@ -90,3 +94,27 @@ def test_no_function_is_named_by_a_participle(path):
     names = {node.name.strip("_") for node in functions(TREES[path])}
     found = {name for name in names if re.fullmatch(r"[a-z]+(ed|ing)", name) or name in IRREGULAR}
     assert found - PARTICIPLES == set()
+
+
+def things(tree):
+    """Yield the name and the line of every variable, argument, field and attribute that a file makes."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.arg(arg=name) | ast.ExceptHandler(name=str(name)) | ast.MatchAs(name=str(name)):
+                yield name, node.lineno
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                yield name, node.lineno
+
+
+@killed_by("simulate/types.py", "    comparison: Int", "    which: Int")
+@pytest.mark.parametrize("path", TREES, ids=str)
+def test_a_thing_has_the_name_of_a_thing(path):
+    assert [f"{name}, line {line}" for name, line in things(TREES[path]) if name.strip("_") in FILLERS] == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["def f(found): pass", "for one in x: pass", "class A:\n    left: int", "self.own = 1", "[most for most in x]"],
+)
+def test_a_filler_is_found(text):
+    assert {name for name, _ in things(ast.parse(text))} & FILLERS

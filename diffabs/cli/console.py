@@ -86,7 +86,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result to stdout a
 
 
 _quiet = False
-_given: tuple[str, ...] = ()  # the words after `diffabs`
+_words: tuple[str, ...] = ()  # the words after `diffabs`
 _begun = time.monotonic()
 
 
@@ -98,8 +98,8 @@ def quieten(quiet: bool) -> None:
 
 def note_command(words: Sequence[str]) -> None:
     """Store the words after `diffabs` of the command that begins, and start its clock."""
-    global _given, _begun
-    _given, _begun = tuple(words), time.monotonic()
+    global _words, _begun
+    _words, _begun = tuple(words), time.monotonic()
     stopwatch.count_compilations()
 
 
@@ -109,7 +109,7 @@ def describe_run() -> dict[str, str | float]:
     "seconds" is the time [s] since `note_command`. "of it compiling" is the part [s] of it that JAX compiled.
     """
     seconds, compiling = time.monotonic() - _begun, stopwatch.compile_time_since(_begun)
-    return {**provenance.describe_making(_given), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
+    return {**provenance.describe_making(_words), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
 
 
 def describe_source(scenario: Scenario) -> JsonObject:

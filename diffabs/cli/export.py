@@ -49,7 +49,9 @@ def export(
         pathlib.Path | None, typer.Option("--out", "-o", metavar="FILE", help="File to write; default: stdout.")
     ] = None,
     single: Annotated[bool, typer.Option("--float32", help="Write numbers in single precision.")] = False,
-    given: Annotated[Given | None, typer.Option(help="Signal that the code takes as a further input.")] = None,
+    extra_input: Annotated[
+        Given | None, typer.Option("--given", help="Signal that the code takes as a further input.")
+    ] = None,
     period: Annotated[
         float | None,
         typer.Option(metavar="SECONDS", help="Sample the scenario's continuous controller with this period."),
@@ -68,7 +70,7 @@ def export(
             console.fail("--json is for --to table; code is text")
         if to is Form.FMU and out is None:
             console.fail("--to fmu needs a file: -o plant.fmu")
-        if to in (Form.TABLE, Form.FMU) and (single or given):
+        if to in (Form.TABLE, Form.FMU) and (single or extra_input):
             console.fail("--float32 and --given are for --to c and --to st")
         if to is Form.FMU and period is not None:
             console.fail("--period is for a controller; --to fmu writes the plant")
@@ -85,7 +87,7 @@ def export(
                         console.say(f"table: {out}")
                     return
                 text = console.run_with_progress(
-                    lambda: _write_source(setup, out, to, single, given), f"tracing {setup.name}"
+                    lambda: _write_source(setup, out, to, single, extra_input), f"tracing {setup.name}"
                 )
             except NotExported as error:
                 # The message names arguments of Python; here they are options of the command.

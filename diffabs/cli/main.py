@@ -80,8 +80,8 @@ def main() -> NoReturn:
     try:
         app()
         status: Scalar = 0
-    except SystemExit as left:
-        status = left.code
+    except SystemExit as leave:
+        status = leave.code
     interrupt.stop_hearing()
     console.leave(status)
 

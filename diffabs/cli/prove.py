@@ -86,7 +86,7 @@ def prove(
                     proof = console.run_with_progress(
                         lambda: prove_box(
                             setup.loop, box, claims, signals=signals, horizon=setup.solver.duration, budget=budget,
-                            known=extremes, suspects=_points(where), progress=lambda line: far.__setitem__(0, line),
+                            extremes=extremes, suspects=_points(where), progress=lambda line: far.__setitem__(0, line),
                         ),
                         f"proving {setup.name}",
                         lambda: far[0],
@@ -149,7 +149,7 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
         extremes, extreme = _extreme_runs(scenario, box)
         verification = console.run_with_progress(
             lambda: verify_box(
-                scenario.loop, scenario.solver.duration, document, share, suspects=_points(extreme), known=extremes,
+                scenario.loop, scenario.solver.duration, document, share, suspects=_points(extreme), extremes=extremes,
                 progress=lambda line: far.__setitem__(0, line), processes=core_count(),
             ),
             f"verifying {file}",
@@ -252,7 +252,7 @@ def _map_of_proof(
     bounds = np.empty(0)
     if proof.rows is not None:
         times = {"stop_time": proof.rows.time, "stop_distance": proof.rows.distance}
-        columns = proof.rows.least if word == "least" else proof.rows.greatest
+        columns = proof.rows.lower if word == "least" else proof.rows.upper
         bounds = columns[:, proof.prover.signals.index(signal)] if word else times[quantity][:, 1]
     kind = "lower" if word == "least" else "upper"
     statement = f": {_describe_claim(claims[0])}" if claims else ""
@@ -266,7 +266,7 @@ def _map_of_proof(
         box=shown_cells(np.array([side.ends for side in sides])),
         cells=shown_cells(proof.cells),
         bounds=bounds,
-        undecided=shown_cells(proof.left),
+        undecided=shown_cells(proof.undecided),
         refuting=None if proof.refuting is None else shown_cells(proof.refuting),
         worst=None if worst is None else np.array(worst)[axes] * scales,
         worst_value=extremes[quantity][1] if quantity in extremes else None,
@@ -385,7 +385,7 @@ def _document(
             bounds[name]["worst_run"] = worst
             bounds[name]["looseness"] = (high - worst) / worst if worst and math.isfinite(high) else None
     widths = np.array([high - low for low, high in box.values()])
-    shares = ((proof.left[:, :, 1] - proof.left[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1)
+    shares = ((proof.undecided[:, :, 1] - proof.undecided[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1)
     refuting = None if proof.refuting is None else dict(zip(box, proof.refuting.tolist(), strict=True))
     if proof.verdict == "refuted":
         reason = "every run violates the claim where " + ", ".join(
@@ -393,11 +393,11 @@ def _document(
             for path, ends in (refuting or {}).items()
         )
     elif proof.verdict == "undecided":
-        cells = "one cell" if len(proof.left) == 1 else f"{len(proof.left):,} cells"
+        cells = "one cell" if len(proof.undecided) == 1 else f"{len(proof.undecided):,} cells"
         reason = f"{100 * shares.sum():.3g} % of the box is left in {cells}"
         reason += f" ({proof.failure})" if proof.failure else ""
         reason += "; a greater --budget goes on" if len(proof.cells) else ""
-        reason = reason if len(proof.left) else proof.failure
+        reason = reason if len(proof.undecided) else proof.failure
     else:
         reason = ""
     return {
@@ -409,7 +409,7 @@ def _document(
         "bounds": bounds,
         "refuted_by": refuting,
         "cells": len(proof.cells),
-        "left": len(proof.left),
+        "left": len(proof.undecided),
         "share_left": float(shares.sum()),
         "tried": proof.tried,
         "seconds": proof.seconds,

@@ -2,7 +2,7 @@
 
 A template has the operands {0} and {1}. In C++ and CUDA the functions are those of `native/functions.h` and
 `native/lane.h`. In C99, {f} is the suffix of a function's name in single precision, and a template with {f} is for real
-numbers only. In Structured Text, {real} is the type of the real numbers and {most} the largest of them.
+numbers only. In Structured Text, {real} is the type of the real numbers and {largest} the largest of them.
 
 An operation without a template in a language has no translation to it. The nodes `const`, `input`, `convert`, `bits`,
 `select`, `gate`, `any` and `table` have no row. They need more than operands, so each back end translates them itself.
@@ -85,7 +85,7 @@ OPERATIONS: dict[str, Operation] = {
     "ne": Operation(np.not_equal, "ne({0}, {1})", "{0} != {1}", "{0} <> {1}", symmetric=True, compares=True),
     "lt": Operation(np.less, "lt({0}, {1})", "{0} < {1}", "{0} < {1}", compares=True),
     "le": Operation(np.less_equal, "le({0}, {1})", "{0} <= {1}", "{0} <= {1}", compares=True),
-    "is_finite": Operation(np.isfinite, "finite({0})", "isfinite({0}) != 0", "ABS({0}) <= {most}", compares=True),
+    "is_finite": Operation(np.isfinite, "finite({0})", "isfinite({0}) != 0", "ABS({0}) <= {largest}", compares=True),
     "and": Operation(np.bitwise_and, "{0} & {1}", "{0} & {1}", "{0} AND {1}", symmetric=True),
     "or": Operation(np.bitwise_or, "{0} | {1}", "{0} | {1}", "{0} OR {1}", symmetric=True),
     "xor": Operation(np.bitwise_xor, "{0} ^ {1}", "{0} ^ {1}", "{0} XOR {1}", symmetric=True),

@@ -8,7 +8,7 @@ import itertools
 import textwrap
 from typing import TypeVar
 
-T = TypeVar("T", bound=type)
+ClassT = TypeVar("ClassT", bound=type)
 
 
 @functools.cache
@@ -27,7 +27,7 @@ def field_meanings(cls: type) -> dict[str, str]:
     return meanings
 
 
-def document_fields(cls: T) -> T:
+def document_fields(cls: ClassT) -> ClassT:
     """Return the dataclass with the meaning of every field, and the range of a parameter, added to its docstring."""
     cls.__doc__ = _Docstring(cls.__doc__ or "")  # pyright: ignore[reportAttributeAccessIssue]  # it returns a text
     return cls

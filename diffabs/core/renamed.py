@@ -18,6 +18,10 @@ RENAMED = {
     "VoltageLimit": {"voltage_max": "high"},
     "ObserverFeedback": {"voltage_max": "predicted_high"},
     "lqg": {"voltage_max": "predicted_high"},
+    "polytope": {"most": "max_points"},
+    "gaussian": {"known": "distributions"},
+    "prove_box": {"known": "extremes"},
+    "verify_box": {"known": "extremes"},
     "ExtremumSeeking": {
         **{"least_slip": "slip_low", "greatest_slip": "slip_high", "least_deceleration": "deceleration_floor"}
     },
@@ -37,9 +41,9 @@ def refuse_old_names(call: Callable[P, R]) -> Callable[P, R]:
     renamed = RENAMED[owner]
 
     @functools.wraps(call)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+    def call_or_refuse(*args: P.args, **kwargs: P.kwargs) -> R:
         for name in renamed.keys() & kwargs.keys():
             raise TypeError(f"{owner} has no {name}: it is now {renamed[name]}")
         return call(*args, **kwargs)
 
-    return checked
+    return call_or_refuse

@@ -45,8 +45,8 @@ def find_problems(part: Part, prefix: str = "", units: Units | None = None) -> I
             has_fault |= bool(within)
             yield from within
     if not has_fault:
-        shapes = shapes or list(_own(part, "problems"))
-        yield from (prefix + insert_unit(line, units) for line in shapes or find_broken(_own(part, "rules")))
+        shapes = shapes or list(_from_hook(part, "problems"))
+        yield from (prefix + insert_unit(line, units) for line in shapes or find_broken(_from_hook(part, "rules")))
 
 
 def part_rules(part: Part, prefix: str = "") -> Iterator[Rule]:
@@ -73,7 +73,7 @@ def find_broken(rules: Iterable[Rule]) -> Iterator[str]:
     yield from (rule.says() for rule in rules if not bool(rule.holds))
 
 
-def _own(part: Part, hook: str, *args: PyTree) -> Iterator[Any]:
+def _from_hook(part: Part, hook: str, *args: PyTree) -> Iterator[Any]:
     """Yield the rules or lines from a method of this part alone."""
     if hasattr(part, hook):
         yield from getattr(part, hook)(*args)
@@ -84,7 +84,7 @@ def _below(part: Part, prefix: str, units: Units | None, hook: str, *args: PyTre
     for name, field, value in children(part, prefix):
         if field is None or "spec" not in field.metadata:
             yield from _below(value, f"{name}.", units_inside(part, name.removeprefix(prefix), units), hook, *args)
-    for finding in _own(part, hook, *args):
+    for finding in _from_hook(part, hook, *args):
         yield finding.under(prefix, units) if isinstance(finding, Rule) else prefix + insert_unit(finding, units)
 
 

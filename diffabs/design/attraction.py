@@ -111,7 +111,7 @@ class _Ellipsoids(NamedTuple):
     hopeless: Scalar
     system: Part
 
-    def own(self, number: Scalar) -> Matrix:
+    def data_of(self, number: Scalar) -> Matrix:
         """Return R and the instability flag of run `number`."""
         # An empty slot of a packed batch has a number beyond the last run.
         system = self.system[jnp.minimum(number, len(self.system) - 1)]

@@ -20,6 +20,7 @@ import numpy as np
 
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.pytree import parameters, replace
+from diffabs.core.renamed import refuse_old_names
 from diffabs.core.types import AnyArray, Matrix, Part, PyTree
 from diffabs.core.validity import check_part
 from diffabs.design.polytopes import MAX_VERTICES, Coverage, Polytope, Schedule
@@ -52,7 +53,8 @@ class _SystemRows(NamedTuple):
 
 
 @default_flags()
-def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9, most: int = 20_000) -> Polytope:
+@refuse_old_names
+def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9, max_points: int = 20_000) -> Polytope:
     """Return the polytope that covers `model` over a box {path: (low, high)}.
 
     Each check uses a grid and 2000 new random points; from the second check on, the grid is twice as fine. The checks
@@ -72,11 +74,11 @@ def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9,
         model: Model with `matrices()`, `states` and `period`.
         over: Box {path: (low, high)} of parameters of the model; a parameter with low = high is fixed.
         grid: Points per parameter of the first check.
-        most: Largest number of grid points in one check; the grid gets coarser to stay below it.
+        max_points: Largest number of grid points in one check; the grid gets coarser to stay below it.
 
     Raises:
         ValueError: A path that is no parameter of the model; an interval that is inverted, not finite or out of range;
-            a period that varies; `most` below 1; more than 2^12 vertices; matrices that are not finite.
+            a period that varies; `max_points` below 1; more than 2^12 vertices; matrices that are not finite.
         ModuleNotFoundError: SciPy is not installed.
 
     Examples:
@@ -87,8 +89,8 @@ def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9,
         ((4, 2, 2), (4, 2, 1), 1.0)
     """
     _require_scipy()
-    if most < 1:
-        raise ValueError(f"most = {most} is outside [1, inf): a check needs a point of the grid")
+    if max_points < 1:
+        raise ValueError(f"max_points = {max_points} is outside [1, inf): a check needs a point of the grid")
     low, high = check_box_bounds(model, over)
     free = tuple(path for path in over if low[path] < high[path])
     if 2 ** len(free) > MAX_VERTICES:
@@ -97,7 +99,7 @@ def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9,
         )
     box = np.array([[low[path], high[path]] for path in free]).reshape(-1, 2)
     data, corners, model = evaluate_grid(model, over, 2)
-    rows, spanning, coverage = _cover_box(model, free, box, data, grid, most)
+    rows, spanning, coverage = _cover_box(model, free, box, data, grid, max_points)
     labels = tuple(corners[i] for i in spanning)
     return Polytope(*data._replace(rows=rows).matrices, model.period, tuple(model.states), labels, coverage)
 

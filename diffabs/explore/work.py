@@ -17,20 +17,20 @@ class NewestJobThread:
         """Start a thread with this `name`."""
         self._job: Job | None = None
         self._ended = False
-        self._there = threading.Condition()
+        self._changed = threading.Condition()
         threading.Thread(target=self._work, name=name, daemon=True).start()
 
     def ask(self, job: Job) -> None:
         """Run the `job` next, in place of a job that waits."""
-        with self._there:
+        with self._changed:
             self._job = job
-            self._there.notify()
+            self._changed.notify()
 
     def end(self) -> None:
         """End the thread after the current job."""
-        with self._there:
+        with self._changed:
             self._ended = True
-            self._there.notify()
+            self._changed.notify()
 
     def _work(self) -> None:
         while (job := self._next()) is not None:
@@ -38,7 +38,7 @@ class NewestJobThread:
                 job()
 
     def _next(self) -> Job | None:
-        with self._there:
-            self._there.wait_for(lambda: self._ended or self._job is not None)
+        with self._changed:
+            self._changed.wait_for(lambda: self._ended or self._job is not None)
             job, self._job = self._job, None
             return None if self._ended else job

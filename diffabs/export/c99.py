@@ -12,7 +12,7 @@ from diffabs.export.device import ComputerProgram, NotExported
 from diffabs.export.lowered import INPUTS, MEMORY, NUMBERS, Lowered
 
 
-def c_source(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
+def c_source(device: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
     """Return the text of a C99 file that runs a controller.
 
     The file has the number type `NAME_real`, the structs `NAME_state`, `NAME_input` and `NAME_parameters` with
@@ -22,7 +22,7 @@ def c_source(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> st
     and writes a line with the command.
 
     Args:
-        found: The computer's part of a loop.
+        device: The computer's part of a loop.
         name: Prefix of the names in C, an identifier.
         notes: Lines for the comment at the head of the file.
 
@@ -34,7 +34,7 @@ def c_source(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> st
     # Integers of 64 bits are in the traced program, even if the reals are of single precision.
     with jax.enable_x64(True):
         try:
-            return "\n".join(_Text(found, name, notes).parts()) + "\n"
+            return "\n".join(_Text(device, name, notes).parts()) + "\n"
         except Unsupported as error:
             raise NotExported(f"{error.primitive} has no translation to C: {error.reason}") from None
 

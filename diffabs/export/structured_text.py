@@ -39,7 +39,7 @@ ST_KEYWORDS = set(ST_KEYWORDS_TEXT.split())
 OWN = {"command", "held", "reset", "started", "i"}  # names that the block itself uses
 
 
-def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
+def structured_text(device: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
     """Return the text of a FUNCTION_BLOCK that runs a controller.
 
     Its inputs are `reset` and the measurements that the controller reads. Its outputs are `command` and `held`, which
@@ -47,7 +47,7 @@ def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()
     It starts at its first call, and again whenever `reset` is true.
 
     Args:
-        found: The computer's part of a loop.
+        device: The computer's part of a loop.
         name: Name of the block, an identifier.
         notes: Lines for the comment at the head of the text.
 
@@ -58,7 +58,7 @@ def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()
         raise NotExported(f"{name!r} is no name that Structured Text has for a block: letters, digits and single _")
     with jax.enable_x64(True):
         try:
-            return "\n".join(_Block(found, name, notes).parts()) + "\n"
+            return "\n".join(_Block(device, name, notes).parts()) + "\n"
         except Unsupported as error:
             why = f"{error.primitive} has no translation to Structured Text: {error.reason}"
             raise NotExported(why) from None
@@ -231,7 +231,7 @@ class _Block:
         template = OPERATIONS[op].st if op in OPERATIONS else None
         if template is None or (op in LOGICAL and not boolean) or (op in ("lt", "le") and boolean):
             raise Unsupported(op, "there is none")
-        return template.format(*args, real=self.real, most=_scientific(np.finfo(self.device.dtype).max))
+        return template.format(*args, real=self.real, largest=_scientific(np.finfo(self.device.dtype).max))
 
     def _convert(self, node: Node, arg: str) -> str:
         """Return a number converted to another type; to an integer by truncation, as in C."""
@@ -241,8 +241,8 @@ class _Block:
         if after == "BOOL":
             return f"{arg} <> {'0.0' if before == self.real else f'{before}#0'}"
         if before == "BOOL":
-            zero, one = ("0.0", "1.0") if after == self.real else (f"{after}#0", f"{after}#1")
-            return f"SEL({arg}, {zero}, {one})"
+            false, true = ("0.0", "1.0") if after == self.real else (f"{after}#0", f"{after}#1")
+            return f"SEL({arg}, {false}, {true})"
         if before == self.real:
             return f"{before}_TRUNC_{after}({arg})"
         return f"{before}_TO_{after}({arg})"

@@ -13,6 +13,7 @@ from jax.tree_util import Partial
 from diffabs.core.bijectors import FreeSpace
 from diffabs.core.kinds import find_value_objection, format_value
 from diffabs.core.pytree import get
+from diffabs.core.renamed import refuse_old_names
 from diffabs.core.types import AnyArray, Part, PyTree, Scalar, Vector
 
 Residuals = Callable[..., Any]  # (part, *data) -> (n,)
@@ -31,20 +32,21 @@ class _GaussianPrior:
         return jnp.concatenate([jnp.ravel((get(part, path) - m) / s) for path, m, s in terms])
 
 
-def gaussian(known: Mapping[str, tuple[PyTree, PyTree]]) -> Prior:
+@refuse_old_names
+def gaussian(distributions: Mapping[str, tuple[PyTree, PyTree]]) -> Prior:
     """Return a prior of independent normal distributions.
 
     Other means and deviations do not compile again.
 
     Args:
-        known: Parameters as {path: (mean, standard deviation)}.
+        distributions: Parameters as {path: (mean, standard deviation)}.
 
     Raises:
         ValueError: No parameter is given, a mean is not finite, or a standard deviation is not positive.
     """
-    if not known:
+    if not distributions:
         raise ValueError("the prior has no parameter; leave the prior out")
-    for path, (mean, deviation) in known.items():
+    for path, (mean, deviation) in distributions.items():
         for name, value in (("mean", mean), ("standard deviation", deviation)):
             if line := find_value_objection(value):
                 raise ValueError(f"{path}: the prior's {name} = {format_value(value)} {line}; it must be a number")
@@ -53,9 +55,9 @@ def gaussian(known: Mapping[str, tuple[PyTree, PyTree]]) -> Prior:
         if not (np.asarray(deviation, float) > 0).all():
             raise ValueError(f"{path}: the prior's standard deviation is {np.min(deviation):g}; it must be positive")
     # np.float64 gives every number one strong type: an int or a weak Python float would compile again.
-    means, deviations = zip(*known.values(), strict=True)
+    means, deviations = zip(*distributions.values(), strict=True)
     return Partial(
-        _GaussianPrior(tuple(known)), *(list(map(jnp.asarray, map(np.float64, x))) for x in (means, deviations))
+        _GaussianPrior(tuple(distributions)), *(list(map(jnp.asarray, map(np.float64, x))) for x in (means, deviations))
     )
 
 

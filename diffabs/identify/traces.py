@@ -84,13 +84,13 @@ class Traces:
             lambda part: [Batch(over).each(canonical_dtypes(part), lambda loop, key: loop)],
         )
 
-    def residuals(self, found: Identified) -> dict[str, np.ndarray]:
-        """Return simulated minus measured values of the fit `found` by column, shape (runs, n).
+    def residuals(self, fit: Identified) -> dict[str, np.ndarray]:
+        """Return simulated minus measured values of a fit by column, shape (runs, n).
 
         Instants after `until` are NaN.
         """
         whole = np.full(len(self.columns) * math.prod(self.shape), np.nan)
-        whole[np.flatnonzero(self._kept_rows())] = found.residuals
+        whole[np.flatnonzero(self._kept_rows())] = fit.residuals
         return dict(zip(self.columns, whole.reshape(len(self.columns), *self.shape), strict=True))
 
     def _broadcast_column(self, column: Any) -> np.ndarray:

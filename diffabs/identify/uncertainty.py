@@ -41,13 +41,13 @@ class Direction(NamedTuple):
     singular: float
     components: dict[str, float]
 
-    def describe(self, least: float = 0.1) -> str:
-        """Return the components of magnitude `least` or more as text.
+    def describe(self, threshold: float = 0.1) -> str:
+        """Return the components of magnitude `threshold` or more as text.
 
         Example: `0.83 plant.mass + 0.55 plant.inertia`.
         """
         terms = sorted(self.components.items(), key=lambda item: -abs(item[1]))
-        text = " ".join(f"{'-' if x < 0 else '+'} {abs(x):.2f} {name}" for name, x in terms if abs(x) >= least)
+        text = " ".join(f"{'-' if x < 0 else '+'} {abs(x):.2f} {name}" for name, x in terms if abs(x) >= threshold)
         return text.removeprefix("+ ")
 
 

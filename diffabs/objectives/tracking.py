@@ -113,11 +113,11 @@ class ITAE(HeldValue):
 
 
 class Extremes(NamedTuple):
-    """Memory of an overshoot: the first, the least and the greatest value of the signal, in its unit."""
+    """Memory of an overshoot: the first, the lowest and the highest value of the signal, in its unit."""
 
     first: Scalar
-    least: Scalar
-    greatest: Scalar
+    lowest: Scalar
+    highest: Scalar
 
 
 @pytree
@@ -159,19 +159,19 @@ class Overshoot(HeldValue):
 
     def update(self, memory: Memory, segment: Segment) -> Extremes:
         """Return the extremes up to the end of the step, from the step's cubic."""
-        first, least, greatest = memory.held
+        first, lowest, highest = memory.held
         signal, output = segment.output(), segment.end.output
         mirrored = signal.times(-1.0)
         top = smaller(signal.greatest(), getattr(output, "highest", math.inf))
-        bottom = -later_of_larger(-least, mirrored.greatest(), mirrored.falls)
-        return Extremes(first, bottom, later_of_larger(greatest, top, signal.falls))
+        bottom = -later_of_larger(-lowest, mirrored.greatest(), mirrored.falls)
+        return Extremes(first, bottom, later_of_larger(highest, top, signal.falls))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return the overshoot [1]; NaN without a step."""
-        first, least, greatest = memory.held
+        first, lowest, highest = memory.held
         setpoint = ending.sample.setpoint
         step = setpoint - first
-        excess = jnp.where(step > 0, greatest - setpoint, setpoint - least)
+        excess = jnp.where(step > 0, highest - setpoint, setpoint - lowest)
         rounding = STEP_EPS * jnp.finfo(jnp.result_type(step)).eps * larger(jnp.abs(setpoint), jnp.abs(first))
         # A NaN denominator, unlike a selected NaN, makes the derivatives NaN, too.
         return larger(excess, 0.0) / jnp.where(jnp.abs(step) <= rounding, jnp.nan, jnp.abs(step))

@@ -152,17 +152,17 @@ def draw_run(run: Run, *, title: str = "", unit: str = "") -> Figure:
     return draw(run, title=title, **({"unit": unit} if unit else {}))
 
 
-def draw_angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:
+def draw_angle_lines(ax: Axes, trajectory: Trajectory, suffix: str = "") -> None:
     """Draw the angles of frame, arm and rider into an axes, or their rates.
 
     Args:
         ax: Axes to draw into.
-        seen: Trajectory of the run.
+        trajectory: Trajectory of the run.
         suffix: "" for angles [rad], "_rate" for rates [rad/s].
     """
     for i, (name, words) in enumerate({"theta": "frame", "psi": "arm", "phi": "rider"}.items()):
-        values = getattr(seen.sample.output, name + suffix)
-        ax.plot(np.asarray(seen.sample.t), values, label=f"{words} {name}", **curve_style(i))
+        values = getattr(trajectory.sample.output, name + suffix)
+        ax.plot(np.asarray(trajectory.sample.t), values, label=f"{words} {name}", **curve_style(i))
 
 
 def shade_region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) -> list[Patch]:

@@ -82,14 +82,14 @@ class CheckedBounds(NamedTuple):
     Attributes:
         stop_time: Bounds of the time at which a run ends, low and high [s]; high is inf if the horizon comes first.
         distance: Bounds of the distance at the end, low and high [m]; high is inf if the horizon comes first.
-        greatest: Upper bound of each signal, in the signal's unit.
-        least: Lower bound of each signal, in the signal's unit.
+        upper: Upper bound of each signal, in the signal's unit.
+        lower: Lower bound of each signal, in the signal's unit.
     """
 
     stop_time: tuple[float, float]
     distance: tuple[float, float]
-    greatest: dict[str, float]
-    least: dict[str, float]
+    upper: dict[str, float]
+    lower: dict[str, float]
 
 
 class _Chord(NamedTuple):

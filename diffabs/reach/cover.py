@@ -16,6 +16,7 @@ import numpy as np
 
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
+from diffabs.core.renamed import refuse_old_names
 from diffabs.core.types import PyTree
 from diffabs.reach.engine import FAILURES, CellBounds, Prover
 from diffabs.reach.equations import LARGEST_INPUT, Equations, derive_equations
@@ -57,7 +58,7 @@ class BoxProof(NamedTuple):
         bounds: Proved range (low, high) of each quantity over the box; infinite ends where nothing is proved.
         cells: Cells that are proved, shape (cells, parameters, 2).
         rows: Bounds of these cells.
-        left: Cells that are not, shape (cells, parameters, 2).
+        undecided: Cells that are not, shape (cells, parameters, 2).
         refuting: Cell that refutes a claim, or None.
         failure: Why most of the last cells that failed did, or an empty text.
         tried: Number of cells that were tried.
@@ -71,7 +72,7 @@ class BoxProof(NamedTuple):
     bounds: dict[str, tuple[float, float]]
     cells: np.ndarray
     rows: CellBounds | None
-    left: np.ndarray
+    undecided: np.ndarray
     refuting: np.ndarray | None
     failure: str
     tried: int
@@ -82,6 +83,7 @@ class BoxProof(NamedTuple):
 
 
 @default_flags()
+@refuse_old_names
 def prove_box(
     loop: Loop,
     over: Mapping[str, tuple[float, float]],
@@ -90,7 +92,7 @@ def prove_box(
     signals: Sequence[str] = (),
     horizon: float = 10.0,
     budget: float = 60.0,
-    known: Mapping[str, tuple[float, float]] | None = None,
+    extremes: Mapping[str, tuple[float, float]] | None = None,
     suspects: Sequence[Sequence[float]] = (),
     progress: Callable[[str], None] = lambda line: None,
     threads: int | None = None,
@@ -104,7 +106,7 @@ def prove_box(
         signals: Further signals whose range is wanted, by name.
         horizon: Duration after which a run that has not stopped is no longer followed [s].
         budget: Computing time [s].
-        known: Least and greatest value of a quantity in runs that were found: bounds are not refined beyond them. A
+        extremes: Least and greatest value of a quantity in runs that were found: bounds are not refined beyond them. A
             bound that such a run violates by more than 0.1 % proves nothing: either it or the run is wrong.
         suspects: Points of the box whose runs may violate a claim; each is tried first, as a cell of one run.
         progress: Called with a line about how far the proof is.
@@ -169,7 +171,7 @@ def prove_box(
     tail, sought = None, False
     while len(unproved) and refuting is None and not hopeless and time.monotonic() - began < budget:
         if tried >= MANY and not sought:
-            sought, tail = True, _find_tail(prover, over, claims, known or {}, began + budget, threads)
+            sought, tail = True, _find_tail(prover, over, claims, extremes or {}, began + budget, threads)
             prover.use_tail(tail)
         unproved = unproved[_order_neighbours(box, unproved)]
         now, unproved = unproved[:BATCH], unproved[BATCH:]
@@ -202,7 +204,7 @@ def prove_box(
     merged = CellBounds(*(np.concatenate(columns) for columns in zip(*rows, strict=True))) if rows else None
     if not claims and not len(unproved) and merged is not None:
         cells, merged, more = _refine(
-            *(prover, quantities, cells, merged, influence, smallest, known or {}),
+            *(prover, quantities, cells, merged, influence, smallest, extremes or {}),
             *(began + budget, progress, threads),
         )
         tried += more
@@ -213,7 +215,7 @@ def prove_box(
     verdict = "refuted" if refuting is not None else "proved" if covered else "undecided"
     if verdict == "proved" and not claims and (nothing := quantities.name_unbounded(bounds)):
         verdict, failure = "undecided", nothing
-    if verdict == "proved" and (contradiction := name_contradiction(bounds, known or {})):
+    if verdict == "proved" and (contradiction := name_contradiction(bounds, extremes or {})):
         verdict, failure, bounds = "undecided", contradiction, quantities.unbounded
     return BoxProof(
         *(verdict, bounds, cells, merged, unproved, refuting, failure if verdict == "undecided" else "", tried),
@@ -280,8 +282,8 @@ class _Quantities:
         word, signal = name.split()
         i = self.signals.index(signal)
         if word == "greatest":
-            return cell_bounds.above[:, i], cell_bounds.greatest[:, i]
-        return cell_bounds.least[:, i], cell_bounds.below[:, i]
+            return cell_bounds.above[:, i], cell_bounds.upper[:, i]
+        return cell_bounds.lower[:, i], cell_bounds.below[:, i]
 
     def weigh_sides(self, name: str, cell_bounds: CellBounds, otherwise: np.ndarray) -> np.ndarray:
         """Return about how much each side of a cell widens its bounds of a quantity, shape (cells, sides).

@@ -123,8 +123,8 @@ class CellBounds(NamedTuple):
         status: 1 if every run of the cell ends, 2 if it is proved up to the horizon, 0 if nothing is proved.
         time: Stop time, low and high [s].
         distance: Stop distance, low and high [m].
-        least: Lower bounds of the signals.
-        greatest: Upper bounds of the signals.
+        lower: Lower bounds of the signals.
+        upper: Upper bounds of the signals.
         below: Values that the signals of every run of the cell fall below, or reach.
         above: Values that the signals of every run of the cell rise above, or reach.
         reach: About the half widths that each parameter causes: of the slip at its greatest (of state 0
@@ -135,8 +135,8 @@ class CellBounds(NamedTuple):
     status: np.ndarray
     time: np.ndarray
     distance: np.ndarray
-    least: np.ndarray
-    greatest: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
     below: np.ndarray
     above: np.ndarray
     reach: np.ndarray
@@ -148,13 +148,13 @@ class CellTube(NamedTuple):
 
     Attributes:
         time: Earliest beginning and latest end of the step, shape (steps, 2) [s].
-        least: Lower bounds of the signals, shape (steps, signals).
-        greatest: Upper bounds of the signals, shape (steps, signals).
+        lower: Lower bounds of the signals, shape (steps, signals).
+        upper: Upper bounds of the signals, shape (steps, signals).
     """
 
     time: np.ndarray
-    least: np.ndarray
-    greatest: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
 
 
 class Prover:

@@ -203,7 +203,7 @@ def _prove_piece(
             return None
         cells = np.array([cut.ends(tuple(over.values()), piece) for cut in pending])
         cell_bounds = piece_prover.prove(np.concatenate([cells, np.tile(places, (len(cells), 1, 1))], 1), threads)
-        narrow = (cell_bounds.status == 1) & (cell_bounds.greatest[:, column] - cell_bounds.least[:, column] <= widest)
+        narrow = (cell_bounds.status == 1) & (cell_bounds.upper[:, column] - cell_bounds.lower[:, column] <= widest)
         proved += [cut for cut, is_narrow in zip(pending, narrow, strict=True) if is_narrow]
         rows.append(CellBounds(*(column[narrow] for column in cell_bounds)))
         pending = [
@@ -212,8 +212,8 @@ def _prove_piece(
             if not is_narrow
             for half in cut.halves(tuple(over.values()), piece, sides)
         ]
-    smallest = np.concatenate([x.least for x in rows]).min(0)
-    greatest = np.concatenate([x.greatest for x in rows]).max(0)
+    smallest = np.concatenate([x.lower for x in rows]).min(0)
+    greatest = np.concatenate([x.upper for x in rows]).max(0)
     slack = RANGE_SLACK * (greatest - smallest)
     ranges = zip((smallest - slack).tolist(), (greatest + slack).tolist(), strict=True)
     ends = dict(zip(piece_prover.signals, ranges, strict=True))

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from diffabs.config.values import format_given
 from diffabs.core.loop import Loop
+from diffabs.core.renamed import refuse_old_names
 from diffabs.core.types import JsonObject
 from diffabs.reach.certificate import FORMAT, proved_ends
 from diffabs.reach.cover import RunClaim, check_box, comes_from_halving, name_contradiction
@@ -218,6 +219,7 @@ def _number(number: Any) -> float:
     return float(number)
 
 
+@refuse_old_names
 def verify_box(
     loop: Loop,
     horizon: float,
@@ -225,7 +227,7 @@ def verify_box(
     share: float = 0.01,
     *,
     suspects: Sequence[Sequence[float]] = (),
-    known: Mapping[str, tuple[float, float]] | None = None,
+    extremes: Mapping[str, tuple[float, float]] | None = None,
     progress: Callable[[str], None] = lambda line: None,
     processes: int = 1,
 ) -> FileVerdict:
@@ -238,8 +240,8 @@ def verify_box(
         horizon: Duration of the file's scenario [s].
         share: Share of the cells to check, in (0, 1]; at least one is checked.
         suspects: Points of the box whose runs may violate a bound, shape (points, parameters), in SI units.
-        known: Least and greatest value of a quantity in simulated runs. A bound that such a run violates by more than
-            0.1 % is not verified.
+        extremes: Least and greatest value of a quantity in simulated runs. A bound that such a run violates by more
+            than 0.1 % is not verified.
         progress: Called with a line about how far the check is.
         processes: Number of processes that check cells at the same time. Several need a main module that can be
             imported, as always with `multiprocessing`.
@@ -252,7 +254,7 @@ def verify_box(
         name: (-math.inf if low is None else low, math.inf if high is None else high)
         for name, (low, high) in file.bounds.items()
     }
-    reason, checked = _find_contradiction(file, horizon) or name_contradiction(bounds, known or {}), 0
+    reason, checked = _find_contradiction(file, horizon) or name_contradiction(bounds, extremes or {}), 0
     if not reason:
         equations = derive_equations(loop, over)
         if unknown := [name for name in file.signals if name not in equations.signals]:
@@ -421,8 +423,8 @@ def _check(
         reason = _compare(
             stated,
             {
-                **{f"greatest {name}": (None, x) for name, x in proved.greatest.items()},
-                **{f"least {name}": (x, None) for name, x in proved.least.items()},
+                **{f"greatest {name}": (None, x) for name, x in proved.upper.items()},
+                **{f"least {name}": (x, None) for name, x in proved.lower.items()},
                 "stop_time": proved.stop_time,
                 "stop_distance": proved.distance,
             },

@@ -24,11 +24,11 @@ SECTION_BY_KIND: dict[str, Callable[[Document], Section]] = {
 }
 
 
-def build_report(found: Sequence[Document], title: str = "") -> str:
+def build_report(documents: Sequence[Document], title: str = "") -> str:
     """Return a report of documents as HTML, with one section each.
 
     Args:
-        found: Documents of the commands.
+        documents: Documents of the commands.
         title: Title of the report; by default the title of the only section, or the number of results.
 
     Raises:
@@ -36,7 +36,7 @@ def build_report(found: Sequence[Document], title: str = "") -> str:
     """
     import jinja2
 
-    sections = [_section(document) for document in found]
+    sections = [_section(document) for document in documents]
     text = (importlib.resources.files("diffabs.report") / "report.html.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
@@ -47,7 +47,7 @@ def build_report(found: Sequence[Document], title: str = "") -> str:
         return environment.from_string(text).render(title=whole, sections=sections, version=__version__)
     except RecursionError:  # lists in lists
         raise ReportError(
-            f"{', '.join(str(document.path) for document in found)}: values are nested too deeply"
+            f"{', '.join(str(document.path) for document in documents)}: values are nested too deeply"
         ) from None
 
 

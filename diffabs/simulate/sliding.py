@@ -34,7 +34,7 @@ def describe_slide(loop: Loop, solver: Solver, objectives: Mapping[str, Objectiv
     """
     if run.slide is None or not np.any(run.slid):
         return ""
-    numbers, times, slid = (np.atleast_1d(np.asarray(x)).ravel() for x in (run.slide.which, run.slide.t, run.slid))
+    numbers, times, slid = (np.atleast_1d(np.asarray(x)).ravel() for x in (run.slide.comparison, run.slide.t, run.slid))
     first = int(np.flatnonzero(slid)[0])
     subject = f"{int(slid.sum())} of {len(slid)} runs slide, run {first}" if np.ndim(run.slid) else "the run slides"
     place = _describe_comparison(_trace_program(loop, solver, objectives), int(numbers[first]))

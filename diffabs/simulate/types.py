@@ -186,11 +186,11 @@ class Slide(NamedTuple):
     """The first slide of a run.
 
     Attributes:
-        which: Number of the comparison along whose surface the run slides; -1 without a slide.
+        comparison: Number of the comparison along whose surface the run slides; -1 without a slide.
         t: Time at which it begins [s]; NaN without a slide.
     """
 
-    which: Int
+    comparison: Int
     t: Scalar
 
 
@@ -229,7 +229,7 @@ class Run(NamedTuple):
 
         A run with fixed steps for values notices it only if it ends steps on switching surfaces (`FixedStep.kinks`).
         """
-        return False if self.slide is None else self.slide.which >= 0
+        return False if self.slide is None else self.slide.comparison >= 0
 
     def __getattr__(self, name: str) -> Any:
         """Raise the AttributeError for a `name` that is no field, with the metrics of the run."""

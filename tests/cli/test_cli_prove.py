@@ -193,7 +193,7 @@ def test_few_runs_of_a_box_are_simulated(wide: int, pinned: int, count: int, mon
 def test_a_bound_around_zero_has_no_relative_looseness() -> None:
     empty = np.zeros((0, 1, 2))
     proof: Any = SimpleNamespace(
-        **{"bounds": {"greatest slip": (0.0, 0.01)}, "left": empty, "cells": empty, "refuting": None},
+        **{"bounds": {"greatest slip": (0.0, 0.01)}, "undecided": empty, "cells": empty, "refuting": None},
         **{"verdict": "proved", "tried": 1, "seconds": 0.0},
     )
     chosen, box = load("slip-lmi", integrated=False), {"plant.mass": (5.0, 6.0)}

@@ -7,14 +7,16 @@ import pytest
 from mutants import killed_by
 
 import diffabs as d
-from diffabs import controllers, linear
+from diffabs import controllers, design, identify, linear, reach
 from diffabs.config.values import ScenarioError
 from diffabs.core.renamed import RENAMED
+from diffabs.reach.verification import verify_box
 from diffabs.scenario.registry import FAMILIES, family_types
 from diffabs.scenario.scenario import load
 
 CLASSES = {type(part).__name__: type(part) for family in FAMILIES for part in family_types(family).values()}
-OWNERS = CLASSES | {"lqg": linear.lqg}
+FUNCTIONS = (linear.lqg, design.polytope, identify.gaussian, reach.prove_box, verify_box)
+OWNERS = CLASSES | {call.__name__: call for call in FUNCTIONS}
 NAMES = [(owner, old, new) for owner, names in RENAMED.items() for old, new in names.items()]
 
 

@@ -207,11 +207,11 @@ def test_many_dimensions_by_linear_programs():
         return pytree(type("Cube", (), {**fields, **names}))(), dict.fromkeys(fields, (0.0, 1.0))
 
     model, over = cube(0.0)
-    p = polytope(model, over, grid=2, most=200)
+    p = polytope(model, over, grid=2, max_points=200)
     assert p.vertices == 128
     assert p.coverage.spread == 1
     assert p.coverage.checked < 300
-    bulged = polytope(cube(0.4)[0], over, grid=3, most=3**7)
+    bulged = polytope(cube(0.4)[0], over, grid=3, max_points=3**7)
     np.testing.assert_allclose(bulged.coverage.spread, 1.2, rtol=0.02)
 
 
@@ -323,8 +323,8 @@ def test_nodes_are_finite_and_a_period_is_a_number():
 
 
 def test_a_check_has_a_point():
-    with pytest.raises(ValueError, match=r"most = 0 is outside \[1, inf\)"):
-        polytope(SlipModel(), PAPER, most=0)
+    with pytest.raises(ValueError, match=r"max_points = 0 is outside \[1, inf\)"):
+        polytope(SlipModel(), PAPER, max_points=0)
 
 
 def test_matrices_that_are_not_finite():

@@ -160,9 +160,9 @@ def test_an_oscillator_is_enclosed(cell, width):
     bounds = check_cell(oscillator(w, until), ("x", "v"), [cell], [0.05], 10.0)
     assert_encloses(bounds.stop_time, [until], width)
     assert_encloses(bounds.distance, [p * math.sin(w * until) / w for p in cell], width)
-    assert cell[1] <= bounds.greatest["x"] <= cell[1] + 1e-9
-    assert -cell[1] >= bounds.least["x"] >= -cell[1] - 1e-3  # within a piece, the rate of all runs is bounded
-    assert -3 * cell[1] >= bounds.least["v"] >= -3 * cell[1] - 3e-3
+    assert cell[1] <= bounds.upper["x"] <= cell[1] + 1e-9
+    assert -cell[1] >= bounds.lower["x"] >= -cell[1] - 1e-3  # within a piece, the rate of all runs is bounded
+    assert -3 * cell[1] >= bounds.lower["v"] >= -3 * cell[1] - 3e-3
 
 
 @killed_by("reach/checker.py", "return _dot(x, y, 0, k, k)", "return _dot(x, y, 0, 0, k)")
@@ -174,7 +174,7 @@ def test_a_logistic_equation_is_enclosed(cell, width):
     starts = np.linspace(*cell, 5)
     assert_encloses(bounds.stop_time, [math.log(until / (1 - until) * (1 - p) / p) / r for p in starts], width)
     assert_encloses(bounds.distance, [math.log((1 - p) / (1 - until)) / r for p in starts], width)
-    assert bounds.least["x"] <= cell[0]
+    assert bounds.lower["x"] <= cell[0]
 
 
 @killed_by("reach/checker.py", "return [_symmetric(x) for x in moved], slack", "return [ZERO] * n, slack")
@@ -187,7 +187,7 @@ def test_a_limit_within_a_flow_is_enclosed(cell, width):
     bounds = check_cell(limited(2.0), ("x", "rate"), [cell], [0.05] * 33 + [1e-3], 10.0)
     assert_encloses(bounds.stop_time, [1 - math.log(p) for p in np.linspace(*cell, 5)], width)
     assert_encloses(bounds.distance, [1 - p + 1.5 for p in np.linspace(*cell, 5)], width)
-    assert 1.0 <= bounds.greatest["rate"] <= 1.0 + width
+    assert 1.0 <= bounds.upper["rate"] <= 1.0 + width
 
 
 def test_a_limit_of_a_limit_is_enclosed():
@@ -221,7 +221,7 @@ def test_a_limit_at_a_tick_is_enclosed(steps):
     truths = [run(p)[0] for p in np.linspace(*cell, 11)]
     assert_encloses(bounds.stop_time, [until], 1e-12)
     assert_encloses(bounds.distance, truths, 1e-3)
-    assert limit <= bounds.greatest["u"] <= limit + 0.02
+    assert limit <= bounds.upper["u"] <= limit + 0.02
 
 
 def test_a_lost_remainder_shows(monkeypatch):
@@ -341,8 +341,8 @@ def test_functions_are_enclosed(name, cell, width):
     bounds = check_cell(e, ("f",), [cell], [0.05], 10.0)
     assert_encloses(bounds.distance, truths, width)
     values = function(np.linspace(cell[0], cell[1] + 1.0, 1001) ** 2)
-    assert bounds.least["f"] <= values.min()
-    assert values.max() <= bounds.greatest["f"]
+    assert bounds.lower["f"] <= values.min()
+    assert values.max() <= bounds.upper["f"]
 
 
 RISING = {  # a function f, c and x of about the same slopes c and f'(x): a wrong sign of f' would lose both
@@ -409,7 +409,7 @@ def test_a_signal_has_the_remainder_of_its_polynomial():
     """The second order of a step of 1e-3 s is 5e-6; the run ends 1e-6 s before step 100 does."""
     until = 0.1 - 1e-6
     bounds = check_cell(oscillator(3.0, until), ("x",), [(1.0, 1.0)], [1e-3], 10.0, order=2)
-    assert math.cos(0.3) - 1e-5 <= bounds.least["x"] <= math.cos(3.0 * until)
+    assert math.cos(0.3) - 1e-5 <= bounds.lower["x"] <= math.cos(3.0 * until)
 
 
 def test_a_cell_of_two_neighbouring_numbers_is_a_set():
@@ -465,7 +465,7 @@ def test_a_wide_cell_is_enclosed_where_the_end_is_not_linear_in_its_start():
     cell = (0.4, 0.5)
     bounds = check_cell(e, ("x",), [cell], [0.05], 10.0)
     assert_encloses(bounds.distance, [-math.log(1 - p) for p in cell], 0.02)
-    assert 1.0 <= bounds.greatest["x"] <= 1.1
+    assert 1.0 <= bounds.upper["x"] <= 1.1
 
 
 def test_a_parameter_of_the_flow_is_enclosed():
@@ -489,7 +489,7 @@ def test_a_wide_parameter_of_the_flow_is_enclosed():
     e = t.equations((zero, zero, zero), (rate, x, one), t("sub", one, time), {"x": x})
     bounds = check_cell(e, ("x",), [(1.0, 2.0)], [1.0], 10.0)
     assert_encloses(bounds.distance, [0.5, 4.0], 3.5)
-    assert 8.0 <= bounds.greatest["x"] <= 18.0
+    assert 8.0 <= bounds.upper["x"] <= 18.0
 
 
 def test_an_end_with_different_rates_is_enclosed():
@@ -533,7 +533,7 @@ def proved_by_engine(equations, cell, horizon):
     prover = engine.Prover(equations, ("slip",), horizon, tolerance=1e-8)
     prover.choose_weights(np.mean(cell, axis=1))
     found = prover.prove(np.array([cell] * 8), 1)
-    return (found.time[0], found.distance[0], found.greatest[0, 0]) if found.status[0] else None
+    return (found.time[0], found.distance[0], found.upper[0, 0]) if found.status[0] else None
 
 
 @pytest.mark.slow
@@ -545,13 +545,13 @@ def test_the_published_gain_with_limits():
         time, distance, slip = measured(LMI, mass, speed)
         assert bounds.stop_time[0] <= time <= bounds.stop_time[1]
         assert bounds.distance[0] <= distance <= bounds.distance[1]
-        assert slip - 1e-6 <= bounds.greatest["slip"] <= slip + 1e-4
+        assert slip - 1e-6 <= bounds.upper["slip"] <= slip + 1e-4
     assert bounds.stop_time[1] - bounds.stop_time[0] < 1e-3
     small = cell_at(5.3, FULL, 0.0005, 0.005 / 3.6)  # within the cell, and one that the engine proves
     if found := proved_by_engine(e, small, 2.5):
         assert found[0] == pytest.approx(bounds.stop_time, rel=1e-3)
         assert found[1] == pytest.approx(bounds.distance, rel=1e-3)
-        assert found[2] == pytest.approx(bounds.greatest["slip"], rel=1e-3)
+        assert found[2] == pytest.approx(bounds.upper["slip"], rel=1e-3)
 
 
 @pytest.mark.slow
@@ -562,9 +562,9 @@ def test_the_cured_gain():
     _, _, slip = measured(CURED, 5.3, FULL)  # its slip is greatest at 0.05 s
     assert 0.1 <= bounds.stop_time[0] <= 0.102
     assert bounds.stop_time[1] == math.inf
-    assert slip - 1e-6 <= bounds.greatest["slip"] <= slip + 1e-4
+    assert slip - 1e-6 <= bounds.upper["slip"] <= slip + 1e-4
     if found := proved_by_engine(e, cell, 0.1):
-        assert found[2] == pytest.approx(bounds.greatest["slip"], rel=1e-3)
+        assert found[2] == pytest.approx(bounds.upper["slip"], rel=1e-3)
 
 
 @killed_by(
@@ -589,4 +589,4 @@ def test_a_rounding_at_a_tick_is_enclosed():
     last = runs / 2 + np.round(4 * runs) / 16
     truths = ways[0] + ways[1] + 0.5 * last
     assert_encloses(bounds.distance, truths.tolist(), 0.4)
-    assert bounds.greatest["x"] >= max(map(np.max, ways))
+    assert bounds.upper["x"] >= max(map(np.max, ways))

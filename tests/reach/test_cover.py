@@ -53,7 +53,7 @@ def test_oscillator_against_its_closed_form() -> None:
     prover = Prover(oscillator(), ("x", "v"), 2.0, order=3, tolerance=1e-6)
     found = prover.prove(np.array([[[1.0, 1.001]]]), 1)
     assert found.status[0] == 2
-    low, high = found.least[0], found.greatest[0]
+    low, high = found.lower[0], found.upper[0]
     assert low[0] <= 1.0 * math.cos(2.0) * 1.001
     assert high[0] >= 1.001
     assert low[1] <= -1.001
@@ -71,9 +71,9 @@ def test_oscillator_against_its_closed_form() -> None:
 def test_a_wide_oscillator_against_its_closed_form() -> None:
     found = Prover(oscillator(), ("x", "v"), 3.0).prove(np.array([[[0.5, 1.5]]]), 1)
     assert found.status[0] == 2
-    assert -1.6 < found.least[0, 0] <= 1.5 * math.cos(3.0)
-    assert 1.5 <= found.greatest[0, 0] < 1.6
-    assert -1.6 < found.least[0, 1] <= -1.5
+    assert -1.6 < found.lower[0, 0] <= 1.5 * math.cos(3.0)
+    assert 1.5 <= found.upper[0, 0] < 1.6
+    assert -1.6 < found.lower[0, 1] <= -1.5
 
 
 def test_ticks_against_their_closed_form() -> None:
@@ -85,8 +85,8 @@ def test_ticks_against_their_closed_form() -> None:
         x, v = 0.5 * x, 0.5 * v
         x, v = x * math.cos(0.25) + v * math.sin(0.25), v * math.cos(0.25) - x * math.sin(0.25)
         least = min(least, x)
-    assert found.least[0, 0] <= least < found.least[0, 0] + 1e-4
-    assert 0.5 <= found.greatest[0, 0] < 0.5 + 1e-6
+    assert found.lower[0, 0] <= least < found.lower[0, 0] + 1e-4
+    assert 0.5 <= found.upper[0, 0] < 0.5 + 1e-6
 
 
 def rig_run(mass: float, speed: float, high: float = 9.03) -> tuple[float, float, float]:
@@ -153,7 +153,7 @@ def test_a_distance_that_is_a_signal_has_its_bounds() -> None:
     _, time, distance = rig_run(5.3, 6.0)
     assert found.time[0, 0] <= time <= found.time[0, 1]
     assert found.distance[0, 0] <= distance <= found.distance[0, 1]
-    assert distance <= found.greatest[0, 1]
+    assert distance <= found.upper[0, 1]
     assert found.distance[0, 1] - found.distance[0, 0] < 0.01
 
 
@@ -247,7 +247,7 @@ def test_a_side_of_two_floats_is_not_halved() -> None:
     """A run that stops too late keeps the proof refining; there is no float between two neighbours."""
     box = {"plant.mass": (float(np.nextafter(5.5, 0.0)), float(np.nextafter(5.5, 6.0)))}
     fast = load("slip-lmi", [*LIMITED, "initial.speed_kmh=7"]).loop
-    proof = prove_box(fast, box, horizon=1.0, budget=60.0, known={"stop_time": (0.001, 0.002)})  # it ends at once
+    proof = prove_box(fast, box, horizon=1.0, budget=60.0, extremes={"stop_time": (0.001, 0.002)})  # it ends at once
     assert proof.cells.tolist() == [[list(*box.values())]]
 
 
@@ -309,7 +309,7 @@ def test_random_runs_lie_within_their_cells(name: str, changes: list[str], claim
     for i, point in enumerate(points):
         inside = ((proof.cells[:, :, 0] <= point) & (point <= proof.cells[:, :, 1])).all(1)
         k = int(np.flatnonzero(inside)[0])
-        assert slip[i] <= proof.rows.greatest[k, 0] + 1e-6
+        assert slip[i] <= proof.rows.upper[k, 0] + 1e-6
         for column, ends in (("time", proof.rows.time[k]), ("distance", proof.rows.distance[k])):
             assert ends[0] - 1e-6 <= runs.metrics[column][i] <= ends[1] + 1e-6
 
@@ -320,7 +320,7 @@ def test_a_run_beyond_a_proved_bound_makes_the_proof_undecided() -> None:
     loop, claims = load("slip-lmi", LIMITED).loop, [RunClaim("greatest slip", 0.9)]
 
     def prove(known):
-        return prove_box(loop, {"plant.mass": (5.5, 5.5)}, claims, horizon=2.5, known=known)
+        return prove_box(loop, {"plant.mass": (5.5, 5.5)}, claims, horizon=2.5, extremes=known)
 
     alone = prove({})
     assert alone.verdict == "proved"
@@ -397,7 +397,7 @@ def test_growth_that_is_faster_than_a_step() -> None:
     operations = tape(*BASIC, ("const", (), 60.0), ("mul", (5, 1)))
     found = Prover(single(operations, 6), ("x",), 0.2, order=8, tolerance=1e9).prove(np.array([[[1.0, 1.0]]]), 1)
     assert found.status[0] == 2
-    assert math.exp(12.0) <= found.greatest[0, 0]
+    assert math.exp(12.0) <= found.upper[0, 0]
 
 
 def test_a_lag_that_is_shorter_than_a_period() -> None:
@@ -416,8 +416,8 @@ def test_a_lag_that_is_shorter_than_a_period() -> None:
         x = u + (x - u) * math.exp(-5.0)
         least = min(least, x)
     assert found.status[0] == 2
-    assert found.least[0, 0] <= least < found.least[0, 0] + 0.05
-    assert 1.0 <= found.greatest[0, 0] < 1.05
+    assert found.lower[0, 0] <= least < found.lower[0, 0] + 0.05
+    assert 1.0 <= found.upper[0, 0] < 1.05
 
 
 @killed_by("reach/native/series.h", "y + symmetric(fill(0.5))", "y")
@@ -436,10 +436,10 @@ def test_a_rounding_at_a_tick_is_enclosed() -> None:
     for _ in range(3):
         runs = runs / 2 + np.round(4 * runs) / 16
         after.append(runs)
-    assert found.least[0, 0] <= np.min(after)
-    assert np.max(after) <= found.greatest[0, 0]
-    assert found.least[0, 0] > np.min(after) - 0.1
-    assert found.greatest[0, 0] < np.max(after) + 0.1
+    assert found.lower[0, 0] <= np.min(after)
+    assert np.max(after) <= found.upper[0, 0]
+    assert found.lower[0, 0] > np.min(after) - 0.1
+    assert found.upper[0, 0] < np.max(after) + 0.1
 
 
 @killed_by("reach/native/prove.cpp", "x = fill(-INFINITY);", "x = fill(-NEVER);", case="rounding")
@@ -455,12 +455,12 @@ def test_what_is_not_proved_has_infinite_bounds(name: str) -> None:
     cell = {"rounding": [3.2, 3.21], "no value": [-0.1, 0.2]}[name]
     found = Prover(e, ("x", "y"), 0.05).prove(np.array([[cell]]), 1)
     assert found.status[0] == 2
-    assert found.least[0, 0] <= cell[0]
-    assert found.greatest[0, 0] >= cell[1]
+    assert found.lower[0, 0] <= cell[0]
+    assert found.upper[0, 0] >= cell[1]
     if name == "rounding":
         assert (found.above[0, 0], found.below[0, 0]) == (-math.inf, math.inf)
     else:
-        assert (found.least[0, 1], found.greatest[0, 1]) == (-math.inf, math.inf)
+        assert (found.lower[0, 1], found.upper[0, 1]) == (-math.inf, math.inf)
 
 
 @killed_by("reach/engine.py", "live |= set(e.nonnegative)", "pass")
@@ -477,7 +477,7 @@ def test_a_tube_holds_the_runs_at_every_time() -> None:
     tube = Prover(oscillator(), ("x", "v"), 2.0).follow(np.array([[1.0, 1.001]]))
     assert tube.time[0, 0] == 0.0
     assert tube.time[-1, 1] >= 2.0
-    for (begin, end), low, high in zip(tube.time, tube.least, tube.greatest, strict=True):
+    for (begin, end), low, high in zip(tube.time, tube.lower, tube.upper, strict=True):
         for t in (begin, end):
             for p in (1.0, 1.001):
                 truth = p * np.array([math.cos(t), -math.sin(t)])

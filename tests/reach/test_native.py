@@ -43,10 +43,10 @@ def test_signals_that_depend_on_no_state_are_bounded(period):
     prover.choose_weights(np.array([0.35]))
     found = prover.prove(CELLS, 1)
     assert found.status.tolist() == [2, 2]
-    np.testing.assert_allclose(found.least[0], [0.3, 5.0, 0.09, 2.5], rtol=1e-12)
-    np.testing.assert_allclose(found.greatest[0], [0.4, 5.0, 0.16, 1 / 0.3], rtol=1e-12)
-    assert (found.least[1] <= [-1.0, 5.0, 0.0, -np.inf]).all()
-    assert (found.greatest[1] >= [2.0, 5.0, 4.0, np.inf]).all()  # p may be 0, so 1/p has no value
+    np.testing.assert_allclose(found.lower[0], [0.3, 5.0, 0.09, 2.5], rtol=1e-12)
+    np.testing.assert_allclose(found.upper[0], [0.4, 5.0, 0.16, 1 / 0.3], rtol=1e-12)
+    assert (found.lower[1] <= [-1.0, 5.0, 0.0, -np.inf]).all()
+    assert (found.upper[1] >= [2.0, 5.0, 4.0, np.inf]).all()  # p may be 0, so 1/p has no value
 
 
 @pytest.mark.usefixtures("native_prover")
@@ -54,9 +54,9 @@ def test_signals_that_depend_on_no_state_are_bounded(period):
 def test_any_signals_may_be_wanted(signals):
     found = Prover(still(), signals, 1.0).prove(CELLS, 2)
     assert found.status.tolist() == [2, 2]
-    assert found.least.shape == (2, len(signals))
+    assert found.lower.shape == (2, len(signals))
     if signals == ("x",):
-        assert found.least[0, 0] <= np.exp(-1.0) < found.least[0, 0] + 0.05
+        assert found.lower[0, 0] <= np.exp(-1.0) < found.lower[0, 0] + 0.05
 
 
 @pytest.mark.usefixtures("native_prover")

@@ -127,7 +127,7 @@ def test_a_cell_that_ends_in_the_tail_bounds_its_runs(period: float | None) -> N
             slip, _, way = run(b, v0, np.array([stop]))
             assert ended.time[i, 0] <= stop <= ended.time[i, 1]
             assert ended.distance[i, 0] <= way[0] <= ended.distance[i, 1]
-            assert slip[0] <= ended.greatest[i, 0]
+            assert slip[0] <= ended.upper[i, 0]
         for mine, other in ((ended.time[i], direct.time[i]), (ended.distance[i], direct.distance[i])):
             assert mine[0] >= other[0] * 0.997
             assert mine[1] <= other[1] * 1.003
@@ -175,7 +175,7 @@ def honest(native_prover: None) -> JsonObject:
         "claims": [],
         "horizon": HORIZON,
         "bounds": {
-            "greatest slip": [None, float(found.greatest[:, 0].max()) * 1.001],
+            "greatest slip": [None, float(found.upper[:, 0].max()) * 1.001],
             "stop_time": [float(found.time[:, 0].min()) * 0.999, float(found.time[:, 1].max()) * 1.001],
         },
         "cells": cells,
@@ -195,7 +195,7 @@ def judge(
 ) -> FileVerdict:
     pytest.importorskip("flint")
     replace_seam(monkeypatch, "verified_equations", lambda loop, over: brake())
-    return verify_box(LOOP, HORIZON, json.loads(json.dumps(document)), 1.0, known=known)
+    return verify_box(LOOP, HORIZON, json.loads(json.dumps(document)), 1.0, extremes=known)
 
 
 def objection(monkeypatch: pytest.MonkeyPatch, document: JsonObject) -> str:

@@ -56,7 +56,7 @@ def run_native(
     values = {**values, **forbid_derivatives(loop, values)}
     count = len(accepted)
     enough = jax.tree.map(jnp.asarray, enough)
-    early_data = None if enough is None else jax.vmap(enough.own)(jnp.arange(count))
+    early_data = None if enough is None else jax.vmap(enough.data_of)(jnp.arange(count))
     lanes = values, keys, accepted, early_data
 
     def run_launch(rows: PyTree) -> Run:

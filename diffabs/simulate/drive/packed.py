@@ -31,7 +31,7 @@ VALUES_ONLY = "together=False has no derivatives by XLA: leave it out, or take e
 class EarlyEnd(Protocol):
     """A condition that ends a run before its stop and its duration, because its outcome is already known; a pytree."""
 
-    def own(self, number: Scalar) -> PyTree:
+    def data_of(self, number: Scalar) -> PyTree:
         """Return the data for run `number` that the condition needs, a pytree."""
         ...
 
@@ -158,7 +158,7 @@ def _lanes_ended_early(
         slots.leaves, slots.carry
     )
     lane_numbers = numbers[jnp.minimum(slots.number, len(numbers) - 1)]
-    return jax.vmap(lambda number, output: enough.has_reached(enough.own(number), output))(lane_numbers, output)
+    return jax.vmap(lambda number, output: enough.has_reached(enough.data_of(number), output))(lane_numbers, output)
 
 
 def _exchange_lanes(

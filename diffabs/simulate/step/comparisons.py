@@ -75,7 +75,7 @@ class SwitchedProgram:
         self._constants: dict[int, PyTree] = {}
         self._names: list[PyTree] = []  # of values; equal for the same operation on the same values
         self._moves: list[bool] = []
-        self._known: dict[PyTree, int] = {}
+        self._numbers: dict[PyTree, int] = {}
         self._zero = self._value("zero", False)
         moves = [True] * len(jax.tree.leaves(moving)) + [False] * len(jax.tree.leaves(fixed))
         self._inputs = [self._value(("in", i), on) for i, on in enumerate(moves)]
@@ -139,7 +139,7 @@ class SwitchedProgram:
 
     def _value(self, name: Any, moves: bool) -> int:
         """Return the number of a new value; equal names mark equal values."""
-        self._names.append(self._known.setdefault(name, len(self._names)))
+        self._names.append(self._numbers.setdefault(name, len(self._names)))
         self._moves.append(moves)
         return len(self._names) - 1
 

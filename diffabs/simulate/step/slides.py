@@ -66,8 +66,8 @@ def watch_landing(watch: SlideWatch, search: EventSearch, landed: Bool, calm: Bo
 
 def begin_slide(slide: Slide, begins: Bool, number: Int, t: Scalar) -> Slide:
     """Return the slide, or a new one along the comparison `number` if it begins and is the first."""
-    first = begins & (slide.which < 0)
-    return Slide(jnp.where(first, number, slide.which), jnp.where(first, jax.lax.stop_gradient(t), slide.t))
+    first = begins & (slide.comparison < 0)
+    return Slide(jnp.where(first, number, slide.comparison), jnp.where(first, jax.lax.stop_gradient(t), slide.t))
 
 
 def slide_of(carry: Any) -> Slide:
@@ -81,4 +81,4 @@ def slide_of(carry: Any) -> Slide:
 
 def has_slid(slide: Slide) -> Array:
     """Return True for a run that slides."""
-    return jnp.asarray(slide.which) >= 0
+    return jnp.asarray(slide.comparison) >= 0
