@@ -114,7 +114,7 @@ def test_what_is_used_most_has_an_example():
     assert {name.removeprefix("diffabs.") for name in EXAMPLES} >= SHOWN
 
 
-@killed_by("linear/regulator.py", "    Notes:\n", "    Remarks:\n", case="lqr")
+@killed_by("linear/regulator.py", "    Notes:\n", "    Remarks:\n", case="linear.regulator.lqr")
 @pytest.mark.parametrize("name", sorted(MOST_USED))
 def test_what_is_used_most_is_explained(name):
     """With what is similar, and with formulas and their sources."""
