@@ -65,7 +65,7 @@ class PID:
         >>> print(f"{pid.output(0.0, pid.start(signal), signal):.1f}")  # 10 + 100 (0.2 - 0.05)
         25.0
 
-        Its limits hold also while the integral grows:
+        A greater error meets the upper limit:
 
         >>> signal = Tracking(target=0.9, measured=(0.05,), feedforward=10.0)
         >>> print(f"{pid.output(0.0, pid.start(signal), signal):.1f}")
