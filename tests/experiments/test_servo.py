@@ -82,7 +82,7 @@ def by_hand(motor, gains):
     return a, np.array([0, 0, 1 / ell, 0, 0]), np.array([-(kp + kd * wc), 0, 0, ki, -kd * wc])
 
 
-@killed_by("objectives/tracking.py", "jnp.where(step > 0, greatest", "jnp.where(step != 0, greatest")
+@killed_by("objectives/tracking.py", "jnp.where(step > 0, highest", "jnp.where(step != 0, highest")
 @killed_by("objectives/tracking.py", 'getattr(output, "highest", math.inf)', 'getattr(output, "highest_signal", 1.0)')
 @pytest.mark.slow
 def test_the_linear_servo_follows_its_closed_form(servo):

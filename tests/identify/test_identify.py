@@ -334,7 +334,7 @@ class TestFit:
         with pytest.raises(ValueError, match=message):
             gaussian({"a": known})
 
-    @killed_by("identify/residuals.py", "if not known:", "if False:")
+    @killed_by("identify/residuals.py", "if not distributions:", "if False:")
     def test_a_prior_without_parameters_is_an_error(self):
         with pytest.raises(ValueError, match="the prior has no parameter; leave the prior out"):
             gaussian({})

@@ -104,7 +104,7 @@ ROOT = math.sqrt(1 - ZETA**2)
 FRACTION = math.exp(-math.pi * ZETA / ROOT)
 
 
-@killed_by("objectives/tracking.py", "setpoint - least)", "greatest - setpoint)")
+@killed_by("objectives/tracking.py", "setpoint - lowest)", "highest - setpoint)")
 @killed_by("objectives/tracking.py", "jnp.nan, jnp.abs(step))", "jnp.nan, jnp.abs(setpoint))")
 @killed_by("objectives/tracking.py", "jnp.abs(step) <= rounding", "step != step")
 def test_overshoot_and_settling_time_are_relative_to_the_step():

@@ -268,7 +268,7 @@ def test_an_edited_tail_is_noticed(monkeypatch: pytest.MonkeyPatch, honest: Json
     assert objection(monkeypatch, document)
 
 
-@killed_by("reach/verification.py", "or name_contradiction(bounds, known or {})", "")
+@killed_by("reach/verification.py", "or name_contradiction(bounds, extremes or {})", "")
 def test_a_bound_that_a_run_violates_is_not_verified(monkeypatch: pytest.MonkeyPatch, honest: JsonObject) -> None:
     """A false piece could make it false in all cells."""
     longest = honest["bounds"]["stop_time"][1]
