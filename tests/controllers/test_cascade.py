@@ -133,6 +133,7 @@ def test_units_of_a_cascade_are_those_of_its_signals(servo):
         check_part(d.replace(closed_loop(servo, cascade()), {"controller.outer.high": np.nan}))
 
 
+@pytest.mark.slow
 def test_a_cascade_by_a_kernel_and_by_xla(servo):
     loop, masses = closed_loop(servo, cascade()), d.Batch({"controller.outer.kp": [20.0, 30.0]})
     kernel, xla = (d.run_batch(loop, masses, SHORT, {"iae": IAE()}, engine=name) for name in ("kernel", "xla"))

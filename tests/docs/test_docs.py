@@ -155,7 +155,7 @@ def test_every_page_is_in_the_navigation():
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The built site; a warning is an error."""
+    """The built site; a warning is an error, for `make docs` as well, which CI runs beside the fast tests."""
     if shutil.which("mkdocs") is None:
         pytest.skip("mkdocs is in the group `docs`")
     folder = tmp_path_factory.mktemp("site")
@@ -166,6 +166,7 @@ def site(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_site_builds_strictly(site):
     assert "margins" in (site / "reference" / "linear" / "index.html").read_text()
     assert re.search(
@@ -173,12 +174,14 @@ def test_the_site_builds_strictly(site):
     )
 
 
+@pytest.mark.slow
 def test_no_page_shows_latex(site):
     page = (site / "plant-in-15-minutes" / "index.html").read_text()
     assert "<math" in page
     assert "\\dot" not in page
 
 
+@pytest.mark.slow
 def test_a_part_has_one_table_and_no_signature(site):
     page = (site / "reference" / "controllers" / "index.html").read_text()
     (pid,) = re.findall(r'<h2 id="diffabs.controllers.PID".*?(?=<h2 )', page, re.DOTALL)
@@ -225,6 +228,7 @@ QUERIES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("node") is None, reason="the search script runs in node")
 def test_the_search_answers(site):
     """By the site's own script, on its own index."""

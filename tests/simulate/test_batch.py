@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from decaying import decay_loop
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from marks import cases
 from mutants import killed_by
@@ -19,7 +20,7 @@ from seams import replace_seam
 import diffabs as d
 from diffabs import controllers, plants
 from diffabs.core.pytree import replace
-from diffabs.objectives import BRAKING
+from diffabs.objectives import BRAKING, IAE
 from diffabs.scenario.defaults import braking
 from diffabs.sensors import Noise
 from diffabs.simulate.batch import Batch, grid, group_by_structure, latin, stack_loops
@@ -362,9 +363,9 @@ def test_a_loop_that_no_run_may_have_is_named_without_values(batch):
 
 @killed_by("simulate/batch.py", "jnp.asarray(column, dtype)", "jnp.asarray(column, float)")
 def test_results_have_the_precision_of_the_loop():
-    loop = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), QUIET)
+    loop, batch = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), decay_loop()), Batch({"plant.rate": [1.0, 2.0]})
     for together in (True, False):
-        run = d.run_batch(loop, Batch({"plant.mass": [5.0, 6.0]}), SOLVER, MEASURED, together=together, engine="xla")
+        run = d.run_batch(loop, batch, d.FixedStep(0.1, 1.0), {"iae": IAE()}, together=together, engine="xla")
         assert {column.dtype for column in run.metrics.values()} == {np.dtype(np.float32)}, together
 
 

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from decaying import decay_loop
 from kernels import FOLDER
 from mutants import killed_by
 from random_nestings import NESTINGS, field_case, find_differences, find_xla_jacobians, loop_case, score
@@ -21,7 +22,7 @@ from seams import replace_seam
 import diffabs as d
 from diffabs import controllers, plants, sensors
 from diffabs.compiler.runtime import library_cache, toolchain
-from diffabs.objectives import BRAKING
+from diffabs.objectives import BRAKING, IAE
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.drive import deferred
 from diffabs.simulate.drive.engine import EngineError
@@ -173,8 +174,8 @@ def test_a_number_that_devices_share_has_the_derivative_by_all_runs():
 
 
 def test_only_the_values_of_a_single_run_stay_with_xla(engines):
-    compare(lambda f: jax.jit(f)(3.0, 1.0))
-    compare(lambda f: jax.jit(jax.grad(f))(3.0, 1.0))
+    start, slope = jax.jit(decay)(3.0, 0.5), jax.jit(jax.grad(decay))(3.0, 0.5)
+    np.testing.assert_allclose([start, slope], np.exp(-0.5) * np.array([3.0, 1.0]), rtol=1e-4)
     why = "XLA, not a kernel: the values of a single run would wait for its compiler"
     assert engines() == [f"1 run: {why}", "1 run with 1 derivative: a kernel"]
 
@@ -287,6 +288,26 @@ class TestLoops:
         np.testing.assert_allclose(found, expected, rtol=1e-11)
 
     def test_a_traced_batch_is_the_same_call(self, engines):
+        solver, measured = d.FixedStep(0.05, 1.0), {"iae": IAE()}
+        controls = jnp.linspace(1.0, 2.0, 5)
+
+        def errors(rate):
+            batch = d.Batch({"controller.torque": controls})
+            return d.run_batch(decay_loop(rate), batch, solver, measured).metrics["iae"].mean()
+
+        def errors_alone(rate):
+            def error(control):
+                loop = d.replace(decay_loop(rate), {"controller.torque": control})
+                return d.measure(loop, solver, measured).metrics["iae"]
+
+            return jax.vmap(error)(controls).mean()
+
+        found, expected = (jax.jit(jax.value_and_grad(f))(2.0) for f in (errors, errors_alone))
+        np.testing.assert_array_equal(found, expected)
+        assert engines() == ["5 runs with 1 derivative: a kernel"]
+
+    @pytest.mark.slow
+    def test_a_traced_batch_of_noisy_runs_is_the_same_call(self, engines):
         solver = d.FixedStep(2e-3, 0.5)
         found = jax.jit(jax.value_and_grad(lambda m: self.distances(m, solver, "auto")))(5.7)
         expected = jax.jit(jax.value_and_grad(lambda m: self.distances(m, solver)))(5.7)

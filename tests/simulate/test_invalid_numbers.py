@@ -29,20 +29,29 @@ def test_a_solution_without_a_value_has_no_derivative(solver):
         np.testing.assert_allclose(slopes(numbers), [np.exp(0.5), np.nan, np.nan], rtol=1e-5)
 
 
+ENDS = jnp.array([0.2, 0.7, 1.2])
+
+
+def saved(start, end, save):
+    """dy/dt = -y from 1: exp(t0 - save)."""
+    found = d.solve(lambda t, y, args: -y, 1.0, start, end, solver=d.Adaptive(1e-8), save=save)
+    return found.y, found.status
+
+
 @killed_by("simulate/solve.py", "jnp.where(save == t0, 1.0, jnp.nan)", "jnp.nan")
 def test_an_empty_span_has_its_start_at_its_saves():
-    """dy/dt = -y from 1: exp(t0 - save), which is 1 here with the slopes 1, 0 and -1 by t0, t1 and `save`."""
+    values, status = jax.jit(jax.vmap(saved, (None, 0, None)))(0.2, ENDS, jnp.array([0.2, 0.7]))
+    np.testing.assert_allclose(values, [[1.0, np.nan], [1.0, np.exp(-0.5)], [1.0, np.exp(-0.5)]], atol=1e-7)
+    assert set(status.tolist()) == {SolutionStatus.FINISHED}
 
-    def saved(start, end, save):
-        found = d.solve(lambda t, y, args: -y, 1.0, start, end, solver=d.Adaptive(1e-8), save=save)
-        return found.y, found.status
 
-    ends, save = jnp.array([0.2, 0.7, 1.2]), jnp.array([0.2])
-    slopes, status = jax.vmap(jax.jacrev(saved, argnums=(0, 1, 2), has_aux=True), (None, 0, None))(0.2, ends, save)
+@pytest.mark.slow
+def test_an_empty_span_has_derivatives_at_its_saves():
+    """Of exp(t0 - save): 1, 0 and -1 by t0, t1 and `save`."""
+    save = jnp.array([0.2])
+    slopes, status = jax.vmap(jax.jacrev(saved, argnums=(0, 1, 2), has_aux=True), (None, 0, None))(0.2, ENDS, save)
     np.testing.assert_allclose(np.concatenate([x.reshape(3, 1) for x in slopes], 1), 3 * [[1.0, 0.0, -1.0]], atol=1e-7)
     assert set(status.tolist()) == {SolutionStatus.FINISHED}
-    values = jax.jit(jax.vmap(saved, (None, 0, None)))(0.2, ends, jnp.array([0.2, 0.7]))[0]
-    np.testing.assert_allclose(values, [[1.0, np.nan], [1.0, np.exp(-0.5)], [1.0, np.exp(-0.5)]], atol=1e-7)
 
 
 LOOP = d.braking(controller=controllers.ConstantTorque(torque=300.0))

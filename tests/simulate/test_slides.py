@@ -139,7 +139,7 @@ SLIDING = {
 }
 
 
-@pytest.mark.parametrize("name", cases(SLIDING, "bang-bang law", "actuator"))
+@pytest.mark.parametrize("name", cases(SLIDING, "bang-bang law", "actuator", "textbook anti-windup"))
 def test_a_sliding_run_has_no_derivative_and_says_so(name):
     """Its value with fixed steps stays, in both modes."""
     (loop, path, begins), solver = SLIDING[name], d.FixedStep(1e-2, END)

@@ -5,11 +5,12 @@ import logging
 import jax
 import numpy as np
 import pytest
+from decaying import decay_loop
 from mutants import killed_by
 from seams import replace_seam
 
 import diffabs as d
-from diffabs.objectives import StopDistance
+from diffabs.objectives import IAE, StopDistance
 from diffabs.simulate import admissible, arguments, ensemble
 from diffabs.simulate.faults import Fault
 
@@ -58,14 +59,15 @@ def test_a_traced_step_is_named_once_unless_it_was_checked(fresh):
 
 @killed_by("simulate/ensemble.py", "np.count_nonzero(checks.codes == code)", "0")
 def test_a_batch_says_why_runs_are_refused(fresh):
-    batch = d.Batch({"plant.mass": np.array([14.0, 15.0, -1.0])})
-    run = d.run_batch(d.braking(), batch, LONG, MEASURED, engine="xla")
+    loop, measured = decay_loop(100.0), {"iae": IAE()}
+    batch = d.Batch({"plant.rate": np.array([100.0, 101.0, -1.0])})
+    run = d.run_batch(loop, batch, LONG, measured, engine="xla")
     assert run.diverged.tolist() == [True, True, True]
-    assert np.isnan(run.metrics["distance"]).all()
+    assert np.isnan(run.metrics["iae"]).all()
     lines = said(fresh)
     assert any(one.startswith("2 of 3 runs are refused and count as diverged: solver.step = 0.5 s") for one in lines)
-    assert any(one.startswith("1 of 3 runs are refused and count as diverged: plant.mass") for one in lines)
-    d.run_batch(d.braking(), d.Batch(), LONG, MEASURED, engine="xla")
+    assert any(one.startswith("1 of 3 runs are refused and count as diverged: plant.rate") for one in lines)
+    d.run_batch(loop, d.Batch(), LONG, measured, engine="xla")
     assert said(fresh)[-1].startswith(
         "1 of 1 runs are refused and count as diverged: solver.step = 0.5 s is not stable:"
     )
