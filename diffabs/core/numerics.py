@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.core.types import PyTree, Scalar
 
@@ -170,3 +171,9 @@ def interpolate_shares(risen: Scalar, values: PyTree) -> Scalar:
 def axpy(a: Scalar, x: Scalar, y: Scalar) -> PyTree:
     """Return a x + y on pytrees."""
     return jax.tree.map(lambda x, y: a * x + y, x, y)
+
+
+def spectral_bound(matrices: np.ndarray, *, discrete: bool = False) -> np.ndarray:
+    """Return the largest real part of the eigenvalues of matrices (..., n, n), or if `discrete` the largest modulus."""
+    modes = np.linalg.eigvals(matrices)
+    return (np.abs(modes) if discrete else np.real(modes)).max(axis=-1)

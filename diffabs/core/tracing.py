@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from diffabs.core.first_order import first_order
 from diffabs.core.pytree import parameters
@@ -75,12 +76,13 @@ def depends_on_signal(function: Callable[[PyTree], PyTree], signal: PyTree) -> b
 
 def leaf_dependence(function: Callable[[PyTree], PyTree], signal: PyTree) -> list[bool]:
     """Return for each leaf of a signal, in order, whether a function depends on it (`depends_on_signal`)."""
-    program = jax.make_jaxpr(function)(signal).jaxpr
-    needed = {atom for atom in program.outvars if not hasattr(atom, "val")}
-    for step in reversed(program.eqns):
-        if not _zero(step) and not needed.isdisjoint(step.outvars):
-            needed.update(atom for atom in step.invars if not hasattr(atom, "val"))
-    return [atom in needed for atom in program.invars]
+    return used_inputs(jax.make_jaxpr(function)(signal).jaxpr, lambda step: not _zero(step))
+
+
+def used_inputs(program: Any, passes: Callable[[Any], bool] = lambda step: True) -> list[bool]:
+    """Return for each input of a jaxpr whether a result depends on it, by the equations that `passes` accepts."""
+    steps = [step for step in program.eqns if passes(step)]
+    return dce_jaxpr(program.replace(eqns=steps), [True] * len(program.outvars))[1]
 
 
 def read_leaves(
@@ -96,14 +98,13 @@ def read_leaves(
 
     def counts(atom: PyTree) -> bool:
         # Integer and boolean values carry no derivative: a comparison ends the dependence.
-        return not hasattr(atom, "val") and (not differentiably or jnp.issubdtype(atom.aval.dtype, jnp.inexact))
+        return not differentiably or jnp.issubdtype(atom.aval.dtype, jnp.inexact)
 
-    needed = {atom for atom in program.outvars if counts(atom)}
-    for step in reversed(program.eqns):
-        if not needed.isdisjoint(step.outvars):
-            needed.update(atom for atom in step.invars if counts(atom))
+    program = program.replace(outvars=[atom for atom in program.outvars if counts(atom)])
+    used = used_inputs(program, lambda step: any(map(counts, step.outvars)))
     leaves, tree = jax.tree.flatten(batch)
-    return tree.unflatten([atom in needed for atom in program.invars[-len(leaves) :]])
+    inputs = zip(program.invars, used, strict=True)
+    return tree.unflatten([is_used and counts(atom) for atom, is_used in inputs][-len(leaves) :])
 
 
 def scan_input_counts(params: Any, inputs: int) -> tuple[int, int]:

@@ -18,6 +18,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from diffabs.core.jax_flags import default_flags
+from diffabs.core.numerics import spectral_bound
 from diffabs.core.types import Matrix
 from diffabs.design import instability, pairs
 from diffabs.design.bounds import BOUND_LOOSENINGS, Bounds, decrease_matrix
@@ -249,10 +250,8 @@ class _Analysis:
 
     def _slowest_mode(self) -> float:
         """Return the decay rate [1/s] of the slowest mode of all vertices."""
-        modes = np.linalg.eigvals(self.closed)
-        if self.discrete:
-            return self._rate_of_factor(np.abs(modes).max())
-        return -float(modes.real.max())
+        slowest = spectral_bound(self.closed, discrete=self.discrete).max()
+        return self._rate_of_factor(slowest) if self.discrete else -float(slowest)
 
     def _least_refuted_rate(self, w: np.ndarray) -> float:
         """Return the smallest rate [1/s] that the multipliers W exclude: sum He[C W] + 2 rate sum W >= 0."""

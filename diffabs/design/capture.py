@@ -31,6 +31,7 @@ from diffabs.actuators import VoltageLimit
 from diffabs.controllers import BalanceFeedback
 from diffabs.core.blocks import Direct
 from diffabs.core.loop import Loop
+from diffabs.core.numerics import spectral_bound
 from diffabs.core.pytree import replace
 from diffabs.core.types import Params, Part, PyTree
 from diffabs.linear.balance_model import BalanceModel
@@ -74,7 +75,7 @@ def capture_ellipsoids(loop: Loop, values: Params) -> CaptureEllipsoids:
     ellipsoids = CaptureEllipsoids(np.full_like(systems.closed, np.inf), np.zeros(len(systems.closed), bool))
     finite = np.flatnonzero(np.isfinite(systems.closed).all(axis=(1, 2)))
     if len(finite):
-        slowest = -np.linalg.eigvals(systems.closed[finite]).real.max(axis=-1)
+        slowest = -spectral_bound(systems.closed[finite])
         # A pole within rounding of the imaginary axis counts neither as stable nor as unstable.
         ellipsoids.unstable[finite] = slowest < -MIN_GROWTH_RATE
         ellipsoids.shapes[finite] = _largest_ellipsoids(jax.tree.map(lambda x: x[finite], systems), slowest)

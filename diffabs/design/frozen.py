@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.numerics import spectral_bound
 from diffabs.core.types import AnyArray, Part
 from diffabs.design.parameter_box import check_box_bounds, evaluate_grid
 from diffabs.design.polytopes import as_gain_matrix
@@ -45,11 +46,12 @@ def analyse_frozen_loops(gain: AnyArray, model: Part, over: Mapping[str, Sequenc
     count = max(2, min(MAX_POINTS_PER_AXIS, int(MAX_BOX_SYSTEMS ** (1 / max(free, 1)) + 1e-9)))
     data, labels, model = evaluate_grid(model, over, count)
     a, b = data.matrices
-    modes = np.linalg.eigvals(a + b @ as_gain_matrix(gain, (data.inputs, data.order)))
+    closed = a + b @ as_gain_matrix(gain, (data.inputs, data.order))
+    slowest = spectral_bound(closed, discrete=model.period is not None)
     if model.period is None:
-        rates = -modes.real.max(axis=1)
+        rates = -slowest
     else:
         # A deadbeat loop has only poles at 0: the smallest float keeps its rate finite.
-        rates = -np.log(np.maximum(np.abs(modes).max(axis=1), np.finfo(float).tiny)) / float(model.period)
+        rates = -np.log(np.maximum(slowest, np.finfo(float).tiny)) / float(model.period)
     i = int(np.argmin(rates))
     return FrozenLoops(len(labels), int((rates > 0).sum()), float(rates[i]), labels[i])

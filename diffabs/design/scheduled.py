@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from diffabs.core.numerics import spectral_bound
 from diffabs.core.types import AnyArray, Matrix, PyTree, Scalar
 from diffabs.design.bounds import BOUND_LOOSENINGS
 from diffabs.design.polytopes import Schedule, as_gain_matrix
@@ -55,7 +56,7 @@ def _fastest_decay_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Cla
     """Return the claim with the fastest decay, by bisection up to the slowest mode of any vertex."""
     pairs = [(cell, k) for i, cell in enumerate(system.cells) for k in gains[i : i + 2]]
     # No P(p) proves a decay faster than the slowest mode of a frozen loop.
-    low, high = spec.decay, min(-np.real(np.linalg.eigvals(cell.closed_loop(k))).max() for cell, k in pairs)
+    low, high = spec.decay, min(-spectral_bound(cell.closed_loop(k)).max() for cell, k in pairs)
     best = None
     while high - low > SCHEDULE_DECAY_TOLERANCE * high:
         rate = (low + high) / 2

@@ -17,6 +17,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from diffabs.core.numerics import spectral_bound
 from diffabs.core.types import AnyArray
 
 # The input moves a mode s if the smallest singular value of the scaled (A - s I, B) exceeds this.
@@ -93,7 +94,7 @@ def _row_scales(a: np.ndarray, b: np.ndarray, rate: float) -> np.ndarray:
     """
     rates = np.full(len(a), rate)
     for group, matrix in _groups(a):
-        rates[group] = max(rate, np.abs(np.linalg.eigvals(np.abs(matrix))).max())
+        rates[group] = max(rate, spectral_bound(np.abs(matrix), discrete=True))
     rates[rates == 0] = 1.0
     with np.errstate(divide="ignore"):
         links, states = np.log(np.abs(a) / rates[:, None]), np.log(np.abs(b).max(axis=1) / rates)

@@ -17,6 +17,7 @@ import numpy as np
 
 from diffabs.controllers import BalanceFeedback
 from diffabs.core.loop import Loop
+from diffabs.core.numerics import spectral_bound
 from diffabs.core.pytree import replace
 from diffabs.core.types import JsonObject, Matrix, Part, PyTree, Table
 from diffabs.design.attraction import Basin, Cells, Reach, largest_recovered_multiples, region_of_attraction
@@ -175,7 +176,7 @@ def heaviest(plant: ArmBalance, gain: np.ndarray) -> float:
     while high - low > 1e-3:
         mass = (low + high) / 2
         a, b = upright_model(replace(plant, {"rider_mass": mass}))
-        held = np.linalg.eigvals(np.asarray(a + b @ gain[None])).real.max() < 0
+        held = spectral_bound(np.asarray(a + b @ gain[None])) < 0
         low, high = (mass, high) if held else (low, mass)
     return low
 

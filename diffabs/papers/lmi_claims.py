@@ -7,6 +7,7 @@ The paper models a car of a tonne by 5 kg.
 import numpy as np
 from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
 
+from diffabs.core.numerics import spectral_bound
 from diffabs.core.types import AnyArray, JsonObject, Matrix
 from diffabs.design import Polytope
 from diffabs.papers import record
@@ -54,7 +55,7 @@ def cost(A: np.ndarray, B: np.ndarray, gain: Matrix, weights: tuple[float, float
     """
     K, Q = np.reshape(gain, (1, 2)), np.diag(weights)
     closed = A + B @ K
-    if np.max(np.linalg.eigvals(closed).real) >= 0:
+    if spectral_bound(closed) >= 0:
         return np.inf
     return float(np.trace(solve_continuous_lyapunov(closed.T, -(Q + K.T @ K))))
 

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import jax
 import numpy as np
-from jax.interpreters.partial_eval import dce_jaxpr
 
 from diffabs.core.bijectors import FreeSpace, Range, parameter_space
 from diffabs.core.jax_flags import default_flags
@@ -12,6 +11,7 @@ from diffabs.core.kinds import find_value_objection, format_value, value_shape
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, get, replace
+from diffabs.core.tracing import used_inputs
 from diffabs.core.types import Params, Part, PyTree
 from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
@@ -234,8 +234,7 @@ def _check_not_overwritten(subject: Part, space: FreeSpace, batch: Batch) -> Non
         return batch.each(loop, lambda loop, key: loop)
 
     start_values = {entry.path: np.asarray(get(subject, entry.path), float) for entry in space.entries}
-    program = jax.make_jaxpr(loops)(start_values).jaxpr
-    _, used = dce_jaxpr(program, [True] * len(program.outvars))
+    used = used_inputs(jax.make_jaxpr(loops)(start_values).jaxpr)
     if idle := [path for path, is_used in zip(sorted(start_values), used, strict=True) if not is_used]:
         by = "`over`" if isinstance(subject, Loop) else "`over` or `closed_loop()`"
         raise ValueError(f"{', '.join(idle)}: free, but {by} gives its value in every run")

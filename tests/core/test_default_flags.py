@@ -21,6 +21,7 @@ STRICT = {
 }
 START, TIMES, RATE = jnp.array([1.0, 0.0]), jnp.linspace(0.0, 1.0, 5), jnp.asarray(1.5)
 RATES = jnp.linspace(1.0, 2.0, 3)
+ACCURATE = d.Adaptive(1e-8)
 
 
 @pytest.fixture
@@ -37,13 +38,17 @@ def spring(t, y, rate):
     return jnp.stack([y[1], -rate * rate * y[0]])
 
 
-def position(rate):
+def position(rate, solver=ACCURATE):
     fall = d.Event(lambda t, y, rate: y[0] + 2.0, terminal=True)  # never: its row of crossings has only NaN
-    return d.solve(spring, START, 0.0, 1.0, rate, solver=d.Adaptive(1e-8), save=TIMES, events=[fall]).y
+    return d.solve(spring, START, 0.0, 1.0, rate, solver=solver, save=TIMES, events=[fall]).y
+
+
+def exact_slopes():
+    """Of cos(rate t) by the rate."""
+    return -np.asarray(TIMES) * np.sin(np.outer(RATES, TIMES))
 
 
 @killed_by("simulate/solve.py", "@default_flags()\ndef solve(", "def solve(")
-@killed_by("simulate/drive/deferred.py", "@default_flags()\ndef _lower(", "def _lower(")
 def test_fields(strict):
     rows = np.asarray(position(RATE))
     many = np.asarray(jax.jit(jax.vmap(position))(RATES))
@@ -52,12 +57,17 @@ def test_fields(strict):
     np.testing.assert_allclose(many[:, :, 0], np.cos(phase), atol=1e-6)
 
 
+def test_derivatives_of_fields(strict):
+    slopes = jax.jit(jax.vmap(jax.jacfwd(lambda rate: position(rate, d.FixedStep(0.02)))))(RATES)
+    np.testing.assert_allclose(np.asarray(slopes)[:, :, 0], exact_slopes(), atol=1e-5)
+
+
 @pytest.mark.slow
+@killed_by("simulate/drive/deferred.py", "@default_flags()\ndef _lower(", "def _lower(")
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-def test_derivatives_of_fields(strict, mode):
+def test_derivatives_of_fields_with_adaptive_steps(strict, mode):
     slopes = jax.jit(jax.vmap(mode(position)))(RATES)
-    exact = -np.asarray(TIMES) * np.sin(np.outer(RATES, TIMES))
-    np.testing.assert_allclose(np.asarray(slopes)[:, :, 0], exact, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(slopes)[:, :, 0], exact_slopes(), atol=1e-5)
 
 
 def test_a_user_may_get_nan_from_a_run_that_diverges():

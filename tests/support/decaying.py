@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 from shown_state import ShownState
 
 import diffabs as d
@@ -37,8 +36,3 @@ def decay_loop(rate: Any = 1.0) -> d.Loop:
         plant=Decay(rate=rate), initial=(), reference=references.Setpoint(value=0.0),
         controller=controllers.ConstantTorque(torque=1.0), stop=stops.NoStop(),
     )  # fmt: skip
-
-
-def decay_place(t: Any, rate: Any, control: Any = 1.0) -> Any:
-    """Return x(t)."""
-    return control / rate * (1 - jnp.exp(-rate * t))

@@ -25,6 +25,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from diffabs.core.numerics import spectral_bound
 from diffabs.core.types import Matrix, Params, PyTree, Scalar
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof import exact, schema, serialise
@@ -230,10 +231,10 @@ class Certificate:
         gains = (
             self.gain if self.gain.ndim == 3 else np.broadcast_to(self.gain, (len(self.cells) + 1, *self.gain.shape))
         )
-        size = np.real if self.period is None else np.abs
         poles = []
         for c, cell in enumerate(self.cells):
-            pair = [size(np.linalg.eigvals(cell.closed_loop(gain))).max(axis=-1) for gain in gains[c : c + 2]]
+            closed = (cell.closed_loop(gain) for gain in gains[c : c + 2])
+            pair = [spectral_bound(matrices, discrete=self.period is not None) for matrices in closed]
             poles += np.max(pair, axis=0).tolist()
         return tuple(poles)
 
