@@ -203,7 +203,7 @@ def test_constraints_may_come_from_a_generator():
     assert problem.excesses == 2 * 2  # of each of two runs
 
 
-@killed_by("tune/tuning.py", "[True] * len(program.outvars)", "[False] * len(program.outvars)", case="log_diagonal")
+@killed_by("core/tracing.py", "[True] * len(program.outvars)", "[False] * len(program.outvars)", case="log_diagonal")
 @pytest.mark.parametrize(
     ("free", "over", "idle"),
     [
