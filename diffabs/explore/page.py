@@ -23,7 +23,7 @@ from diffabs.explore.panels import Curves, Fan
 from diffabs.explore.results import ResultsPanel
 from diffabs.explore.saver import Saver
 from diffabs.explore.session import NOT_PROVED, Basis, ProofVerdict, Session, Tools, check_edit, objections
-from diffabs.explore.tuner import Tuner
+from diffabs.explore.tuner import Reactions, Tuner
 from diffabs.explore.work import NewestJobThread
 from diffabs.scenario.scenario import Scenario
 
@@ -55,7 +55,8 @@ class Page:
         self.controls = Controls(session, self._change, self._replaced, self._widen)
         self.results = ResultsPanel()
         self.saver = Saver(session, folder)
-        self.tuner = Tuner(self, thread)
+        reactions = Reactions(self.later, self.show_refusal, self._show_values, self.pin)
+        self.tuner = Tuner(session, tools.pose, reactions, thread)
         self.body: Any = None
         self.client.on_delete(self.end)
 
@@ -131,6 +132,10 @@ class Page:
         """Set all numbers back to the scenario's values."""
         self.session.reset()
         self.show_refusal(None)
+        self._show_values()
+
+    def _show_values(self) -> None:
+        """Show the session's values in all controls, and compute everything again."""
         self.controls.show_all()
         self.redraw()
 

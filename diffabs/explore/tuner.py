@@ -1,7 +1,8 @@
 """The dialog and the card of a tuning: free parameters, progress, and values before and after."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
@@ -12,11 +13,11 @@ from diffabs.explore import curves, tuning
 from diffabs.explore.canvas import Canvas
 from diffabs.explore.knobs import unit_words
 from diffabs.explore.panels import Curves, format_reading
+from diffabs.explore.session import Session
 from diffabs.explore.work import NewestJobThread
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
-    from diffabs.explore.page import Page
     from diffabs.tune.result import TuningProgress
 
 Fields = tuple[Any, Any]  # fields of the lower and the upper bound
@@ -30,12 +31,28 @@ LOSS = {
 }
 
 
+class Reactions(NamedTuple):
+    """What the page does for its tuner.
+
+    Attributes:
+        later: Calls a function with these arguments in the server's thread.
+        show_refusal: Shows why something was refused; None removes the message.
+        show_values: Shows the session's values in all controls and runs the loop with them.
+        pin: Keeps curves beside the later ones; None removes them.
+    """
+
+    later: Callable[..., None]
+    show_refusal: Callable[[Exception | None], None]
+    show_values: Callable[[], None]
+    pin: Callable[[Curves | None], None]
+
+
 class Tuner:
     """One tuning at a time, in its own thread. Its result replaces all edits made during the tuning."""
 
-    def __init__(self, page: "Page", thread: str):
-        """Prepare the tuner of a `page`; `thread` is the name of its thread. The page stays unchanged."""
-        self.page = page
+    def __init__(self, session: Session, pose: Callable[[Scenario], tuning.TuningTask], page: Reactions, thread: str):
+        """Prepare the tuner of a `session`, whose tasks `pose` makes; `thread` is the name of its thread."""
+        self.session, self.pose, self.page = session, pose, page
         self.worker = NewestJobThread(thread)
         self.stopping, self.running = False, False
         self.origin: Scenario | None = None
@@ -63,7 +80,7 @@ class Tuner:
         if self.running:
             ui.notify("a tuning is under way", type="warning")
             return
-        now = self.page.session.scenario()
+        now = self.session.scenario()
         paths, metric = tuning.default_tuning(now)
         self.dialog.clear()
         with self.dialog, ui.card().style("min-width: 460px").props("data-id=ask-tuning"):
@@ -96,7 +113,7 @@ class Tuner:
 
     def _bounds(self, place: Scalar, now: Scenario, paths: list[str], fields: dict[str, Fields]) -> None:
         """Show fields for the lower and upper bound of each free number."""
-        knobs = self.page.session.knobs
+        knobs = self.session.knobs
         place.clear()
         fields.clear()
         with place:
@@ -131,7 +148,7 @@ class Tuner:
         )
 
     def _start(self, paths: list[str], metric: str, bounded: dict[str, tuple[PyTree, PyTree]]) -> None:
-        session = self.page.session
+        session = self.session
         try:
             scenario = tuning.scenario_with_goal(session.scenario(), paths, metric, session.knobs, bounded)
         except Exception as error:  # also an unexpected one says why nothing starts
@@ -158,12 +175,12 @@ class Tuner:
     def _tune(self, scenario: Scenario) -> None:
         later = self.page.later
         try:
-            posed = self.page.tools.pose(scenario)
+            posed = self.pose(scenario)
             before = curves.run_curves(scenario)
             tuned = tuning.tune_scenario(
                 scenario,
                 posed,
-                self.page.session.knobs,
+                self.session.knobs,
                 lambda progress: later(self._show_progress, progress),
                 lambda: self.stopping,
             )
@@ -200,16 +217,15 @@ class Tuner:
         self.running = False
         if self.origin is None:
             return
-        session = self.page.session
+        session = self.session
         self._table(scenario, tuned, before, after)
         session.adopt(tuned.after.loop)
-        self.page.controls.show_all()
         self.page.pin(before)
-        self.page.redraw()
+        self.page.show_values()
 
     def _table(self, scenario: Scenario, tuned: tuning.TuningFound, before: Curves, after: Curves) -> None:
         """Show the free parameters and the metrics before and after the tuning."""
-        knobs = self.page.session.knobs
+        knobs = self.session.knobs
         self.card.clear()
         with self.card:
             with ui.element("div").classes("card-title"):
@@ -244,8 +260,7 @@ class Tuner:
     def _go_back(self) -> None:
         """Return to the numbers before the tuning."""
         if self.origin is not None:
-            self.page.session.adopt(self.origin.loop)
-            self.page.controls.show_all()
-            self.page.redraw()
+            self.session.adopt(self.origin.loop)
+            self.page.show_values()
         self.card.set_visibility(False)
         self.page.pin(None)

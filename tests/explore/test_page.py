@@ -541,7 +541,7 @@ def test_the_card_counts_runs_rounds_and_iterations(visit):
 @pytest.mark.parametrize("left", [False, True])
 def test_a_failed_tuning_is_told_to_its_own_scenario(visit, left):
     async def user(opened):
-        opened.page.tools = opened.page.tools._replace(pose=broken)
+        opened.page.tuner.pose = broken
         opened.click("tune")
         opened.click("start")
         if left:
