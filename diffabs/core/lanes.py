@@ -6,10 +6,12 @@ from typing import Any, TypeVar
 import jax
 import jax.custom_batching
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 
 from diffabs.core.types import Bool, PyTree
 
 X = TypeVar("X")
+DECISION = "decision"  # name of what checkpoints keep (`keep_decision`)
 
 
 @jax.custom_batching.custom_vmap
@@ -40,8 +42,17 @@ def jit_barrier(active: Bool, work: Callable[[], X]) -> X:
 
 
 def rematerialise(body: Any) -> PyTree:
-    """Return `body` with checkpointing: reverse mode keeps only its arguments and computes everything else again."""
-    return jax.checkpoint(body, policy=jax.checkpoint_policies.nothing_saveable, prevent_cse=False)
+    """Return `body` with checkpointing: reverse mode keeps its arguments and decisions, and computes the rest again."""
+    return jax.checkpoint(body, policy=jax.checkpoint_policies.save_only_these_names(DECISION), prevent_cse=False)
+
+
+def keep_decision(decision: X) -> X:
+    """Return the `decision`, a pytree, for `rematerialise` to keep.
+
+    What XLA computes again it may round in another way. A decision that depends on the last digits would then be
+    another one, and the derivative that of no run.
+    """
+    return jax.tree.map(lambda x: checkpoint_name(x, DECISION), decision)
 
 
 def select(condition: Bool, a: X, b: X) -> X:

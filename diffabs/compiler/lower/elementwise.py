@@ -59,6 +59,7 @@ def _integer_quotient(graph: Graph, x: Node, y: Node) -> Node:
 
 
 @lowering_rule("stop_gradient copy copy_p optimization_barrier pvary")
+@lowering_rule("name", "name")
 @lowering_rule("reshard", "dst_sharding concrete_mesh")
 def _identity(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
     return ins

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from diffabs.core.lanes import any_lane, jit_barrier, select
+from diffabs.core.lanes import any_lane, jit_barrier, keep_decision, select
 from diffabs.core.log import borrow, log_rows, write_last_rows
 from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.protocols import Clock
@@ -217,7 +217,7 @@ def advance(
     # where reverse mode would multiply 0 by a rate that may be infinite.
     barrier = jit_barrier if stepping.second_order or not stepping.smooth else lambda active, work: work()
     attempt = barrier(active, attempt_request)
-    decision = barrier(active, lambda: stepping.decide(system, carry, request, attempt, active))
+    decision = keep_decision(barrier(active, lambda: stepping.decide(system, carry, request, attempt, active)))
 
     strikes = decision.accepted & request.strikes
     k = jnp.where(strikes, request.strike, carry.k)
@@ -240,7 +240,9 @@ def advance(
     elif stepping.smooth:
         after = after._replace(status=_next_status(system, carry, attempt, decision, carry.status))
     after = stepping.plan_next(system, carry, attempt, decision, after)
-    after = after._replace(status=jnp.where(active, after.status, carry.status).astype(carry.status.dtype))
+    status = jnp.where(active, after.status, carry.status).astype(carry.status.dtype)
+    status, unrestricted = keep_decision((status, after.unrestricted))
+    after = after._replace(status=status, unrestricted=unrestricted)
     if until is not None:  # without a pause, the other fields of a run that is over have no effect
         after = select(active, after, carry)
     return after._replace(point=after.point._replace(state=borrow(after.point.state, logs)))
@@ -260,6 +262,8 @@ def _search(
 
     # Few attempts search, so a batch skips the search unless one of its runs needs it.
     search, length, status = jax.lax.cond(any_lane(decision.searches), next_plan, lambda: plan)
+    number, located, at_once = keep_decision((search.number, search.located, search.at_once))
+    search = search._replace(number=number, located=located, at_once=at_once)
     status = _next_status(system, carry, attempt, decision, status)
     return after._replace(search=search, length=length, status=status)
 

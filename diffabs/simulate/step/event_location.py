@@ -31,7 +31,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.lanes import select
+from diffabs.core.lanes import keep_decision, select
 from diffabs.core.numerics import ratio
 from diffabs.core.types import AnyArray, Bool, Int, PyTree, Scalar
 from diffabs.simulate.step.modes import ComparisonAnswers, SurfaceCrossing, find_contradicted
@@ -272,11 +272,11 @@ def _locate_event(
     more = ratio(ratio(ratio(at_last - g, last - x) - fall, last - place) - bend, last - end)
     more *= (length - place) * (length - x) + (length - place + length - x) * (length - end)
     slope += jnp.where(jnp.abs(more) <= MAX_CUBIC_CORRECTION * jnp.abs(slope), more, 0.0)
-    beyond_probe = jnp.abs(length - place) > jnp.abs(x - place)
+    beyond_probe = keep_decision(jnp.abs(length - place) > jnp.abs(x - place))
     length = jnp.where(beyond_probe, jnp.maximum(jnp.minimum(length, search.far), search.near), length)
-    has_tangent = search.located & (slope < 0) & ~beyond_probe
+    has_tangent = keep_decision(search.located & (slope < 0) & ~beyond_probe)
     moved = length + jnp.where(beyond_probe, 0.0, _length_tangent(search, x, probe.end, length, slope))
-    steep = _falls_from_start(search, at_place, start)
+    steep = keep_decision(_falls_from_start(search, at_place, start))
     has_tangent &= ~search.at_once | steep
     # For an event at the beginning of the step the length is clipped at 0 in value, but not in its derivative.
     at_once = jnp.where(steep, moved - jax.lax.stop_gradient(jnp.minimum(moved, 0.0)), 0.0)
