@@ -41,9 +41,13 @@ def jit_barrier(active: Bool, work: Callable[[], X]) -> X:
     return jax.lax.cond(any_lane(active), work, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape))
 
 
-def rematerialise(body: Any) -> PyTree:
-    """Return `body` with checkpointing: reverse mode keeps its arguments and decisions, and computes the rest again."""
-    return jax.checkpoint(body, policy=jax.checkpoint_policies.save_only_these_names(DECISION), prevent_cse=False)
+def rematerialise(body: Any, keeps_decisions: bool = False) -> PyTree:
+    """Return `body` with checkpointing: reverse mode keeps its arguments, and its decisions if `keeps_decisions`.
+
+    It computes everything else again.
+    """
+    names = (DECISION,) if keeps_decisions else ()
+    return jax.checkpoint(body, policy=jax.checkpoint_policies.save_only_these_names(*names), prevent_cse=False)
 
 
 def keep_decision(decision: X) -> X:

@@ -28,11 +28,11 @@ from diffabs.simulate.drive.deferred import run_deferred
 from diffabs.simulate.drive.engine import default_engine
 from diffabs.simulate.drive.loops import (
     log_run,
-    repeat_step,
     replay_log,
     round_up_capacity,
     run_to_end,
     run_with_trajectory,
+    scan_steps,
     scan_with_trajectory,
 )
 from diffabs.simulate.result import Finish, finish_run, observe, prepare
@@ -162,12 +162,10 @@ def run_unchecked(
     steps, every = solver.steps, int(every)
     count = -(-steps // every) if every else 0
     between = min(every, steps) if every else round_up_capacity(steps)
-    tries = round_up_capacity(
-        log_capacity(loop, solver) if isinstance(solver, Adaptive) else method.capacity(loop, between)
-    )
+    room = round_up_capacity(log_capacity(loop, solver)) if isinstance(solver, Adaptive) else between
     if every and isinstance(method, AdaptiveStepping):
         method = dataclasses.replace(method, keeps_last_step=True)
-    capacity = RunCapacity(tries, round_up_capacity(count) if every else 0, every)
+    capacity = RunCapacity(room, round_up_capacity(count) if every else 0, every)
     # Capacities are static and rounded up, so that similar durations share one compiled program.
     arguments = loop, objectives, method, key
     if not every and engine != "xla" and is_traced(loop, objectives, key):
@@ -180,13 +178,14 @@ class RunCapacity(NamedTuple):
     """Capacities that are fixed at compilation.
 
     Attributes:
-        tries: Capacity for attempts in the whole run. For fixed steps with a trajectory: between two of its instants.
+        room: Capacity for attempts in the whole run with adaptive steps. With fixed steps for steps of the grid: in the
+            whole run, or between two instants of a trajectory.
         instants: Capacity for instants of a trajectory after t = 0; 0 without one.
         every: Number of grid steps between two instants; 0 without a trajectory.
         finish: Function that returns the result from loop, objectives and the last carry, and the last instant.
     """
 
-    tries: int
+    room: int
     instants: int
     every: int
     finish: Finish = finish_run
@@ -265,14 +264,18 @@ def _run_reversible(
         return _run_by_replay(loop, objectives, method.for_replay(), key, capacity)
     method = method.for_derivatives()
     loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
-    carry, (tries, instants, every, finish) = method.start(loop, objectives, key), capacity
+    carry, (room, instants, every, finish) = method.start(loop, objectives, key), capacity
+
+    def attempts(steps: int) -> int:
+        return round_up_capacity(method.capacity(loop, steps))
+
     if not every:
         # A run that needs more attempts than there is room for is still running: `end_unfinished`.
-        carry = repeat_step(stepped, carry, tries, lambda carry: carry.running)
+        carry = scan_steps(stepped, method.is_active, carry, 0, None, room, attempts)
         return finish(loop, objectives, end_unfinished(carry))[0]
     first, count = method.observe_at(loop, carry, 0), -(-method.steps // every)
     carry, trajectory = scan_with_trajectory(
-        stepped, method.is_active, partial(method.observe_at, loop), carry, every, count, instants, tries
+        stepped, method.is_active, partial(method.observe_at, loop), carry, every, count, instants, attempts
     )
     judged = finish_run(loop, objectives, end_unfinished(carry))
     return _attach_trajectory(judged, *_void_trajectories(loop, judged[0], first, trajectory))
@@ -283,7 +286,7 @@ def _run_by_replay(
 ) -> Run:
     """Return a run with adaptive steps for derivatives in both modes: logged for its values, then replayed."""
     loop, audit = prepare(loop)
-    objectives, (tries, instants, every, finish) = objectives | audit, capacity
+    objectives, (room, instants, every, finish) = objectives | audit, capacity
     # The log holds values only: derivatives come from the replay.
     still, measures = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
     logged = dataclasses.replace(live, keeps_last_step=False)
@@ -292,7 +295,7 @@ def _run_by_replay(
         partial(logged.renew, still),
         log_attempt,
         logged.start(still, measures, key),
-        tries,
+        room,
     )
     log = jax.lax.stop_gradient(log)
     status = end_unfinished(carry).status

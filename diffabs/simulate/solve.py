@@ -595,8 +595,8 @@ def solve(
         method = dataclasses.replace(method, watches=False, smooth=True, **lean)
     saves = {} if save_objective is None else {"saves": save_objective}
 
-    capacity = method.capacity(loop, count) if isinstance(method, FixedStepping) else log_capacity(loop, any_solver)
-    capacity = RunCapacity(round_up_capacity(capacity), 0, 0, _finish_solution)
+    room = count if isinstance(method, FixedStepping) else log_capacity(loop, any_solver)
+    capacity = RunCapacity(round_up_capacity(room), 0, 0, _finish_solution)
     run = loop, saves, method, None
     if engine == "kernel" or (engine == "auto" and is_traced(loop, saves)):
         return run_deferred(run_differentiable, capacity, run, required=engine == "kernel")

@@ -62,6 +62,7 @@ SEAMS = {
     "stable_step": "diffabs.simulate.admissible.stable_step",
     "measured_step": "diffabs.simulate.arguments.find_unstable_step",
     "max_saved_carries": "diffabs.simulate.drive.loops.MAX_SAVED_CARRIES",
+    "segment_steps": "diffabs.simulate.drive.loops.SEGMENT_STEPS",
     "max_lanes_per_launch": "diffabs.simulate.drive.kernel.MAX_LANES_PER_LAUNCH",
     "lanes_at_once": "diffabs.simulate.drive.packed.LANES_AT_ONCE",
     "core_count": "diffabs.simulate.drive.sharding.core_count",

@@ -23,7 +23,8 @@ X = TypeVar("X")
 Carry = Any  # pytree of the stepping method, with an attribute `running`
 # Function of a carry and, for trajectories, of `until`, the number of the grid instant at which to pause.
 Step = Callable[..., Carry]
-SCAN_GROUP_STEPS = 32  # steps that are skipped together, in scans of at most MAX_SAVED_CARRIES steps
+SCAN_GROUP_STEPS = 32  # attempts that are skipped together
+SEGMENT_STEPS = 128  # least number of grid steps that reverse mode computes again together
 MAX_SAVED_CARRIES = 1800  # carries that reverse mode keeps in one scan: some 0.2 MB for each run of a batch
 BLOCKS_PER_GROUP = 32  # blocks of a logged run that are skipped together
 STEPS_PER_BLOCK = 16  # steps between two checks of `running`, which is a reduction over the whole batch
@@ -84,9 +85,9 @@ def scan_with_trajectory(
     every: int,
     count: Int,
     instants: int,
-    room: int,
+    capacity: Callable[[int], int],
 ) -> tuple[Carry, PyTree]:
-    """Return what `run_with_trajectory` does, for derivatives. There is `room` for attempts between two samples.
+    """Return what `run_with_trajectory` does, for derivatives. Between two samples there is room as in `scan_steps`.
 
     The samples have a leading axis of `instants`; those beyond `count` come from the final carry. Reverse mode keeps
     the carry at each sample, and computes the steps between two samples again.
@@ -96,7 +97,7 @@ def scan_with_trajectory(
         until = (i + 1) * every
 
         def go_to_sample(carry: Carry) -> Carry:
-            return repeat_step(lambda carry: step(carry, until=until), carry, room, lambda carry: before(carry, until))
+            return scan_steps(step, before, carry, i * every, until, every, capacity)
 
         # The scan has `instants` rounds, the run only `count`: the rest is skipped, not computed and discarded.
         carry = jax.lax.cond(i < count, go_to_sample, lambda carry: carry, carry)
@@ -105,34 +106,60 @@ def scan_with_trajectory(
     return jax.lax.scan(rematerialise(segment), carry, jnp.arange(instants))
 
 
+def scan_steps(
+    step: Step,
+    on: Callable[[Carry, PyTree], PyTree],
+    carry: Carry,
+    first: Int,
+    last: Int | None,
+    steps: int,
+    capacity: Callable[[int], int],
+) -> Carry:
+    """Return the carry at the grid instant `last`, or at the end of the run, from that at `first`. For derivatives.
+
+    There is room for `steps` steps of the grid, and `capacity(n)` is the room for attempts in n of them. `on(carry, i)`
+    is True if the run goes on and has not reached the instant i. Reverse mode keeps the carry of each attempt. If these
+    are more than `MAX_SAVED_CARRIES`, it keeps the carry of each segment, and computes a segment again.
+
+    Segments end at instants of the grid. Rounding may change the number of attempts in what is computed again, but not
+    the instant.
+    """
+
+    def go(carry: Carry, until: Int | None, steps: int) -> Carry:
+        return repeat_step(
+            lambda carry: step(carry, until=until), carry, capacity(steps), lambda carry: on(carry, until)
+        )
+
+    if capacity(steps) <= MAX_SAVED_CARRIES:
+        return go(carry, last, steps)
+    length = max(SEGMENT_STEPS, math.ceil(steps / MAX_SAVED_CARRIES))
+
+    def segment(carry: Carry, i: Int) -> tuple[Carry, None]:
+        end = first + (i + 1) * length
+        until = end if last is None else jnp.minimum(end, last)
+        running = any_lane(jax.lax.stop_gradient(on(carry, until)))
+        return jax.lax.cond(running, lambda carry: go(carry, until, length), lambda carry: carry, carry), None
+
+    return jax.lax.scan(rematerialise(segment), carry, jnp.arange(math.ceil(steps / length)))[0]
+
+
 def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X], PyTree]) -> X:
     """Return the carry after whole groups of steps, with room for at least `capacity` steps.
 
     A group is skipped where `on(carry)` is False for all runs of the batch. Within a group `on` is not asked: `step`
-    must leave a run that is over as it is. Reverse mode keeps the carry of each step. Beyond `MAX_SAVED_CARRIES` steps
-    it keeps the carry of each group and computes the steps of a group again.
+    must leave a run that is over as it is. Reverse mode keeps the carry and the decisions of each step.
     """
-    outer, inner = nested_scan_lengths(capacity)
+    length = min(SCAN_GROUP_STEPS, capacity)
 
     def group(carry: X) -> X:
-        return jax.lax.scan(rematerialise(lambda carry, _: (step(carry), None)), carry, length=inner)[0]
+        body = rematerialise(lambda carry, _: (step(carry), None), keeps_decisions=True)
+        return jax.lax.scan(body, carry, length=length)[0]
 
     def body(carry: X, _: object) -> tuple[X, None]:
         running = any_lane(jax.lax.stop_gradient(on(carry)))
         return jax.lax.cond(running, group, lambda carry: carry, carry), None
 
-    # Checkpoints on both levels: memory for the carries of the groups plus those of one group at a time.
-    return jax.lax.scan(rematerialise(body) if capacity > MAX_SAVED_CARRIES else body, carry, length=outer)[0]
-
-
-def nested_scan_lengths(count: int) -> tuple[int, int]:
-    """Return the number of groups and the number of steps in a group for at least `count` steps.
-
-    Up to `MAX_SAVED_CARRIES` steps a group has `SCAN_GROUP_STEPS` steps. Beyond, both numbers together are at most 3/2
-    `MAX_SAVED_CARRIES`, up to a count of MAX_SAVED_CARRIES^2/2.
-    """
-    inner = math.ceil(count / MAX_SAVED_CARRIES) if count > MAX_SAVED_CARRIES else min(SCAN_GROUP_STEPS, count)
-    return math.ceil(count / inner), inner
+    return jax.lax.scan(body, carry, length=math.ceil(capacity / length))[0]
 
 
 def log_run(
@@ -180,7 +207,7 @@ def replay_log(
     # Checkpoints on both levels: memory for the states of the blocks plus those of one block.
     @rematerialise
     def block(carry: Carry, entries: PyTree) -> tuple[Carry, PyTree]:
-        return jax.lax.scan(rematerialise(attempt), carry, entries)
+        return jax.lax.scan(rematerialise(attempt, keeps_decisions=True), carry, entries)
 
     blocks = len(accepted(log))
     return _scan_active(block, lambda _, entries: jnp.any(accepted(entries)), carry, log, blocks)
