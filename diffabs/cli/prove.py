@@ -1,11 +1,10 @@
 """The command `prove`: bounds of all runs of a box of parameters, of the nonlinear loop with its limits."""
 
 import functools
-import itertools
 import json
 import math
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
@@ -25,11 +24,9 @@ if TYPE_CHECKING:
     from diffabs.plot.proofs import ProofMap
     from diffabs.reach import BoxProof, RunClaim
     from diffabs.reach.equations import Equations
+    from diffabs.reach.extremes import ExtremeRuns
 
-SEARCHED = (9, 17)  # runs along the first and the second of two parameters, among which the worst is looked for
-MANY_SEARCHED, MOST_RUNS = 5, 1_000  # runs along each of more parameters; fewer where the grid would have more runs
 MOST_BYTES = 2**28  # of a file that is read; some million cells
-NO_LOCK, OVERSHOOT, TIMES = "no_lock", "overshoot", ("stop_time", "stop_distance")
 
 
 def prove(
@@ -65,6 +62,7 @@ def prove(
         from diffabs.compiler.runtime.toolchain import NoCompiler
         from diffabs.reach import NoRule, prove_box
         from diffabs.reach.equations import derive_equations
+        from diffabs.reach.extremes import find_extreme_runs
 
         setup = console.load_scenario(scenario, changes or (), integrated=False)
         sides = _read_sides(over, setup)
@@ -82,18 +80,19 @@ def prove(
                 try:
                     equations = derive_equations(setup.loop, box)  # refuses before anything is simulated
                     claims = [_read_claim(text, setup, equations) for text in claim or ()]
-                    extremes, where = _extreme_runs(setup, box)
+                    extremes = find_extreme_runs(setup.loop, setup.solver, box)
                     proof = console.run_with_progress(
                         lambda: prove_box(
                             setup.loop, box, claims, signals=signals, horizon=setup.solver.duration, budget=budget,
-                            extremes=extremes, suspects=_points(where), progress=lambda line: far.__setitem__(0, line),
+                            extremes=extremes.ranges, suspects=extremes.points,
+                            progress=lambda line: far.__setitem__(0, line),
                         ),
                         f"proving {setup.name}",
                         lambda: far[0],
                     )  # fmt: skip
                 except (NoRule, NoCompiler) as error:
                     raise ScenarioError(str(error)) from None
-                result = _document(proof, setup, box, claims, extremes)
+                result = _document(proof, setup, box, claims, extremes.ranges)
                 show_result = functools.partial(_show, result, setup, as_json)
                 if file:
                     from diffabs.reach.certificate import certificate_document
@@ -105,7 +104,7 @@ def prove(
                 from diffabs.plot.proofs import draw_proof
 
                 with console.show_before_errors(show_result):
-                    shown = _map_of_proof(proof, setup, sides, claims, extremes, where)
+                    shown = _map_of_proof(proof, setup, sides, claims, extremes)
                     console.run_with_progress(lambda: draw_proof(shown).savefig(picture), "drawing")
                 result["files"] |= {"plot": str(plot)}
         show_result()
@@ -135,6 +134,7 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
     console.need_extra("proof")
     from diffabs.reach import NoRule
     from diffabs.reach.equations import derive_equations
+    from diffabs.reach.extremes import find_extreme_runs
     from diffabs.reach.verification import read_proof, verify_box
 
     far = [""]
@@ -146,11 +146,11 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
         box = read_proof(document).over
         derive_equations(scenario.loop, box)  # refuses a loop or a box without rules before anything is simulated
         # The runs that would show a false bound are looked for, and their cells are proved again.
-        extremes, extreme = _extreme_runs(scenario, box)
+        extremes = find_extreme_runs(scenario.loop, scenario.solver, box)
         verification = console.run_with_progress(
             lambda: verify_box(
-                scenario.loop, scenario.solver.duration, document, share, suspects=_points(extreme), extremes=extremes,
-                progress=lambda line: far.__setitem__(0, line), processes=core_count(),
+                scenario.loop, scenario.solver.duration, document, share, suspects=extremes.points,
+                extremes=extremes.ranges, progress=lambda line: far.__setitem__(0, line), processes=core_count(),
             ),
             f"verifying {file}",
             lambda: far[0],
@@ -225,14 +225,11 @@ def _read_sides(options: Sequence[str], scenario: Scenario) -> list[_Side]:
     return sides
 
 
-def _is_wide(ends: tuple[float, float]) -> bool:
-    """Return whether a range has more than one value, apart from the rounding by which `_read_sides` widens it."""
-    return ends[1] - ends[0] > 1e-12 * max(map(abs, ends))
-
-
 def _choose_axes(sides: Sequence[_Side]) -> list[int]:
     """Return the indices of the parameters with more than one value. Raises ScenarioError unless there are 1 or 2."""
-    wide = [i for i, side in enumerate(sides) if _is_wide(side.ends)]
+    from diffabs.reach.extremes import is_wide
+
+    wide = [i for i, side in enumerate(sides) if is_wide(side.ends)]
     if len(wide) not in (1, 2):
         raise ScenarioError(f"--plot draws one or two parameters; {len(wide)} of --over have more than one value")
     return wide
@@ -240,7 +237,7 @@ def _choose_axes(sides: Sequence[_Side]) -> list[int]:
 
 def _map_of_proof(
     proof: "BoxProof", scenario: Scenario, sides: Sequence[_Side], claims: Sequence["RunClaim"],
-    extremes: Mapping[str, tuple[float, float]], where: Mapping[str, list[float]],
+    extremes: "ExtremeRuns",
 ) -> "ProofMap":  # fmt: skip
     """Return the map of the first claim's quantity, else of the greatest slip, in the units of the given ranges."""
     from diffabs.plot.proofs import ProofMap
@@ -260,7 +257,7 @@ def _map_of_proof(
     def shown_cells(cells: np.ndarray) -> np.ndarray:
         return cells[..., axes, :] * scales[:, None]
 
-    worst = where.get(quantity)
+    worst = extremes.worst.get(quantity)
     return ProofMap(
         labels=[sides[i].label for i in axes],
         box=shown_cells(np.array([side.ends for side in sides])),
@@ -269,7 +266,7 @@ def _map_of_proof(
         undecided=shown_cells(proof.undecided),
         refuting=None if proof.refuting is None else shown_cells(proof.refuting),
         worst=None if worst is None else np.array(worst)[axes] * scales,
-        worst_value=extremes[quantity][1] if quantity in extremes else None,
+        worst_value=extremes.ranges[quantity][1] if quantity in extremes.ranges else None,
         quantity=f"proved {kind} bound of {signal.replace('_', ' ')} [{_unit_of(quantity, scenario)}]",
         claimed=claims[0].bound if claims else None,
         title=f"{scenario.title or scenario.name}\n{proof.verdict}{statement}",
@@ -278,97 +275,33 @@ def _map_of_proof(
 
 def _read_claim(text: str, scenario: Scenario, equations: "Equations") -> "RunClaim":
     """Return a claim about a signal, the stop time or the stop distance. Raises ScenarioError."""
-    from diffabs.reach import RunClaim
+    from diffabs.reach import claims
 
     name, equals, number = text.partition("=")
-    signals = scenario.loop.plant.shows._fields
-    quantities = [*(f"{word}_{signal}" for signal in signals for word in ("max", "min")), *TIMES]
-    quantities += [OVERSHOOT, NO_LOCK] if "slip" in signals else []
-    if name not in quantities:
-        raise unknown_name_error(f"--claim {name} is not a quantity of this loop", name, quantities)
-    if name == NO_LOCK:
+    names = claims.claimable_names(scenario.loop.plant.shows._fields)
+    if name not in names:
+        raise unknown_name_error(f"--claim {name} is not a quantity of this loop", name, names)
+    if name == claims.NO_LOCK:
         if equals:
             raise ScenarioError("--claim no_lock has no bound: it says that the slip stays below 1")
-        return RunClaim("greatest slip", float(np.nextafter(1.0, 0.0)))
+        return claims.no_lock_claim()
     try:
         bound = read_decimal(number)
     except ValueError:
         bound = math.nan
     if not math.isfinite(bound):
         raise ScenarioError(f"--claim {text} needs a finite number: {name}=BOUND")
-    if name == OVERSHOOT:
-        if bound < 0:  # the metric is 0 for every run below its target
-            raise ScenarioError(f"--claim {OVERSHOOT} = {bound:g} is outside [0, inf)")
-        return _overshoot_claim(bound, equations)
-    if name in TIMES:
-        return RunClaim(name, bound)
-    word, _, signal = name.partition("_")
-    return RunClaim(f"{'greatest' if word == 'max' else 'least'} {signal}", bound)
-
-
-def _overshoot_claim(bound: float, equations: "Equations") -> "RunClaim":
-    """Return the bound of the slip that bounds the metric `Overshoot`; refuse a step that differs between runs."""
-    from diffabs.reach import RunClaim
-
-    ends = [*(equations.start[i] for i in equations.nonnegative), equations.signals["setpoint"]]
-    operations = [equations.operations[i] for i in ends]
-    numbers = [operation.value for operation in operations if operation.name == "const"]
-    if len(numbers) < 2:
-        raise ScenarioError(
-            f"--claim {OVERSHOOT} needs one start slip and one target for all runs; here one of them changes in a run "
-            "or over the box: --claim max_slip=BOUND"
-        )
-    first, setpoint = numbers
-    step = setpoint - first
-    if step == 0:
-        raise ScenarioError(f"--claim {OVERSHOOT} needs a step; the runs start on their target: --claim max_slip=BOUND")
-    limit = setpoint + bound * step
-    rounding = 2.0**-50 * (abs(setpoint) + bound * abs(step))  # the numbers may be rounded decimals
-    return RunClaim("greatest slip", limit - rounding) if step > 0 else RunClaim("least slip", limit + rounding)
+    try:
+        return claims.named_claim(name, bound, equations)
+    except ValueError as error:
+        instead = ": --claim max_slip=BOUND" if bound >= 0 else ""
+        raise ScenarioError(f"--claim {error}{instead}") from None
 
 
 def _unit_of(quantity: str, scenario: Scenario) -> str:
     """Return the unit of a quantity of a proof, empty if the plant declares none."""
     units = {"stop_time": "s", "stop_distance": "m", **scenario.loop.plant.shows.units}
     return units.get(quantity.split()[-1], "")
-
-
-def _extreme_runs(
-    scenario: Scenario, box: dict[str, tuple[float, float]]
-) -> tuple[dict[str, tuple[float, float]], dict[str, list[float]]]:
-    """Return least and greatest value of greatest slip, stop time and stop distance in a grid of runs, and the point of
-    each greatest one.
-    """
-    import diffabs as d
-    from diffabs.core.protocols import BrakeOutput
-    from diffabs.objectives import MaxSlip, StopDistance, StopTime
-    from diffabs.stops import SpeedReached
-
-    if scenario.loop.plant.shows is not BrakeOutput:
-        return {}, {}
-    wide = sum(map(_is_wide, box.values()))
-    per_axis = next(n for n in range(MANY_SEARCHED, 0, -1) if n**wide <= MOST_RUNS)
-    counts = SEARCHED if len(box) < 3 else (per_axis,) * len(box)
-    axes = [np.linspace(*ends, n) if n > 1 and _is_wide(ends) else [0.5 * sum(ends)]
-            for ends, n in zip(box.values(), counts, strict=False)]  # fmt: skip
-    points = np.array(list(itertools.product(*axes)))
-    metrics = {"greatest slip": MaxSlip(), "stop_time": StopTime(), "stop_distance": StopDistance()}
-    batch = d.Batch(dict(zip(box, points.T, strict=True)))
-    runs = d.run_batch(scenario.loop, batch, scenario.solver, metrics)
-    columns = {name: np.asarray(column) for name, column in runs.metrics.items()}
-    if not isinstance(scenario.loop.stop, SpeedReached):
-        # These metrics extrapolate to rest; the proof is about the stop's own speed.
-        del columns["stop_time"], columns["stop_distance"]
-    worst = {name: int(np.nanargmax(column)) for name, column in columns.items() if np.isfinite(column).any()}
-    return (
-        {name: (float(np.nanmin(columns[name])), float(columns[name][i])) for name, i in worst.items()},
-        {name: points[i].tolist() for name, i in worst.items()},
-    )
-
-
-def _points(where: Mapping[str, list[float]]) -> list[list[float]]:
-    """Return points, each once."""
-    return list(map(list, dict.fromkeys(map(tuple, where.values()))))
 
 
 def _document(
