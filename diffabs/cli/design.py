@@ -7,7 +7,7 @@ import functools
 import math
 import pathlib
 from collections.abc import Sequence
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,10 @@ from diffabs.cli import certificates, console, prove, show, targets
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
 from diffabs.runtime import provenance
+from diffabs.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from diffabs.design.loop_task import ProofTask
 
 CHECK = "check it with: diffabs verify"
 
@@ -33,19 +37,19 @@ def design(
     Its certificate proves the cost with a P of its own, so the guaranteed cost may be lower."""
     with console.end_on_errors(), certificates.report_design_errors():
         with targets.new_target_file(out, "--out") as file:
-            task = _prepare(scenario, changes or (), weighed=True)
+            setup, task = _prepare(scenario, changes or (), weighed=True)
             from diffabs.design import synthesis
 
             try:
                 solution = console.run_with_progress(
-                    lambda: synthesis.design(task.polytope, task.spec), f"designing for {task.scenario.name}"
+                    lambda: synthesis.design(task.polytope, task.spec), f"designing for {setup.name}"
                 )
             except synthesis.DesignError as error:
                 if as_json:
-                    show.as_json(certificates.proof_document(task, reason=str(error)))
-                console.fail(f"{task.scenario.name}: {error}", console.FAILED)
+                    show.as_json(certificates.proof_document(setup, task, reason=str(error)))
+                console.fail(f"{setup.name}: {error}", console.FAILED)
             numbers = {name: getattr(solution, name) for name in (*certificates.FROM_DESIGN, "trace_cost")}
-            document = functools.partial(certificates.proof_document, task, solution.certificate, **numbers)
+            document = functools.partial(certificates.proof_document, setup, task, solution.certificate, **numbers)
             if file:
                 with console.show_before_errors(lambda: _show(document(), task, as_json)):
                     solution.certificate.save(file)
@@ -65,22 +69,23 @@ def certify(
     """Prove that a gain is stable over the ranges of [design.over].
 
     The result, proved or disproved, holds for parameters that vary arbitrarily fast."""
+    from diffabs.design import findings
+
     with console.end_on_errors(), certificates.report_design_errors():
         with targets.new_target_file(out, "--out") as file:
-            task = _prepare(scenario, changes or (), gain)
-            proof = console.run_with_progress(
-                lambda: certificates.certify_gain(task), f"certifying {task.scenario.name}"
-            )
+            setup, task = _prepare(scenario, changes or (), gain)
+            proof = console.run_with_progress(task.certify, f"certifying {setup.name}")
+            document = functools.partial(certificates.proof_document, setup, task, proof)
             if file:
-                with console.show_before_errors(lambda: _show(certificates.proof_document(task, proof), task, as_json)):
+                with console.show_before_errors(lambda: _show(document(), task, as_json)):
                     proof.save(file)
         further = console.run_with_progress(
-            lambda: certificates.find_further(task, proof), "analysing the loops at fixed parameters"
+            lambda: findings.find_further(task, proof), "analysing the loops at fixed parameters"
         )
-        reason = certificates.describe_unproved(proof, task.spec, further)
-        _show(certificates.proof_document(task, proof, out, reason=reason or None, further=further), task, as_json)
+        reason = findings.describe_unproved(proof, task.spec, further)
+        _show(document(out, reason=reason or None, further=further), task, as_json)
         if reason:
-            console.conclude(f"{task.scenario.name}: {reason}")
+            console.conclude(f"{setup.name}: {reason}")
 
 
 def verify(
@@ -128,21 +133,22 @@ def verify(
 
 def _prepare(
     scenario: str, changes: Sequence[str], gain: str | None = None, *, weighed: bool = False
-) -> certificates.ProofTask:
+) -> tuple[Scenario, "ProofTask"]:
     setup = console.load_scenario(scenario, changes, integrated=False)
-    return console.run_with_progress(
+    return setup, console.run_with_progress(
         lambda: certificates.build_proof_task(setup, gain, weighed=weighed), "computing the polytope"
     )
 
 
-def _show(result: JsonObject, task: certificates.ProofTask, as_json: bool) -> None:
+def _show(result: JsonObject, task: "ProofTask", as_json: bool) -> None:
     if as_json:
         show.as_json(result)
     else:
+        from diffabs.design.findings import VERDICT_WORDS
+
         units = {path: spec.unit for path, spec, _ in parameters(task.model)}
-        show.show_proof(
-            result, f"{task.scenario.name}: u = K x", units, certificates.VERDICT_WORDS[result["quadratically_stable"]]
-        )
+        verdict = VERDICT_WORDS[result["quadratically_stable"]]
+        show.show_proof(result, f"{result['scenario']}: u = K x", units, verdict)
     for line in task.reduced.neglected:
         console.say(f"neglected: {line}")
     if not task.reduced.exact:

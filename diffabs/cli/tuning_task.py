@@ -15,6 +15,7 @@ from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.admissible import first_refusal
 
 if TYPE_CHECKING:
+    from diffabs.design.loop_task import ProofTask
     from diffabs.tune import Batch, Tuned
 
 WHEN = ("before", "after")
@@ -35,7 +36,7 @@ class Work(NamedTuple):
     scenario: Scenario
     batch: "Batch"
     constraints: JsonObject
-    task: certificates.ProofTask | None
+    task: "ProofTask | None"
 
 
 class Proved(NamedTuple):
@@ -50,7 +51,7 @@ class Proved(NamedTuple):
 
     document: JsonObject
     sentence: str
-    task: certificates.ProofTask | None = None
+    task: "ProofTask | None" = None
     certified: bool = False
 
 
@@ -77,20 +78,20 @@ def certify_result(after: Scenario) -> Proved:
     The certificate has the fastest decay rate that is found. If [tune] requires a faster one, it has that one if it can
     be proved. Without a certificate the outcome gives the reason; no error is raised.
     """
+    from diffabs.design import findings
+
     decay = after.tune.decay
     try:
         task = certificates.build_proof_task(after)
-        proof = certificates.certify_gain(task)
+        proof = task.certify()
         if (proof.decay_rate or 0.0) < decay:  # the search for the fastest decay ends slightly below the optimum
-            faster_proof = certificates.certify_gain(
-                task._replace(spec=dataclasses.replace(task.spec, decay=decay * (1 + BOUND_ROUNDING)))
-            )
+            faster_proof = task.certify(dataclasses.replace(task.spec, decay=decay * (1 + BOUND_ROUNDING)))
             proof = faster_proof if (faster_proof.decay_rate or 0.0) >= decay else proof
     except (ModuleNotFoundError, ValueError, np.linalg.LinAlgError) as error:
         return without_certificate(" ".join(str(error).split()))
-    further = certificates.find_further(task, proof)
-    reason = certificates.describe_unproved(proof, task.spec, further) or None
-    document = certificates.proof_document(task, proof, reason=reason, further=further)
+    further = findings.find_further(task, proof)
+    reason = findings.describe_unproved(proof, task.spec, further) or None
+    document = certificates.proof_document(after, task, proof, reason=reason, further=further)
     document = {key: value for key, value in document.items() if key not in OF_THE_COMMAND}
     rate = document["decay_rate"]
     over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())
@@ -154,7 +155,7 @@ def _constraints(work: Work, tuned: "Tuned", proved: Proved) -> list[JsonObject]
         before, after = (float(np.max(metrics[name])) for metrics in tuned.metrics)
         rows.append(_constraint_row(name, bound, before, after, at_most=True))
     if work.task and goal.decay:
-        before, after = certificates.certify_gain(work.task).decay_rate, proved.document["decay_rate"]
+        before, after = work.task.certify().decay_rate, proved.document["decay_rate"]
         rows.append(_constraint_row("certified decay", goal.decay, before, after, at_most=False))
     if work.task and goal.damping:
         before = _least_damping(work.task, work.scenario.loop)
@@ -175,7 +176,7 @@ def _constraint_row(name: str, bound: float, before: float | None, after: float 
     return {**row, "met": beyond <= 0, "missed": missed}
 
 
-def _least_damping(task: certificates.ProofTask, loop: Part) -> float:
+def _least_damping(task: "ProofTask", loop: Part) -> float:
     """Return the least damping of the poles over the vertices."""
     from diffabs.tune import Poles
 

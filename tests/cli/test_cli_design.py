@@ -17,7 +17,7 @@ from seams import replace_seam
 from diffabs.cli import certificates
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Scalar
-from diffabs.design import Certificate, DesignError
+from diffabs.design import Certificate, DesignError, findings
 from diffabs.design.frozen import analyse_frozen_loops
 from diffabs.design.sdp import solver
 from diffabs.linear.linearization import StateSpace
@@ -183,7 +183,7 @@ def infeasible(monkeypatch):
 
 @killed_by(
     "cli/design.py",
-    "                    show.as_json(certificates.proof_document(task, reason=str(error)))\n",
+    "                    show.as_json(certificates.proof_document(setup, task, reason=str(error)))\n",
     "                    pass\n",
 )
 def test_no_gain_could_not_be_done(tmp_path, infeasible):
@@ -284,7 +284,7 @@ def greatest_deceleration(speed):
     return (4316.4 * 0.3 + 0.856 * speed**2) / 440.0 + 0.01 * 9.81
 
 
-@killed_by("cli/certificates.py", "i = int(np.argmax(decelerations / speeds))", "i = 0")
+@killed_by("design/loop_task.py", "i = int(np.argmax(decelerations / speeds))", "i = 0")
 @killed_by("design/speed_scaled.py", "if not deceleration * period < speed:", "if False:")
 def test_the_relative_fall_counts_air_drag_at_every_speed(tmp_path):
     path = tmp_path / "vehicle.toml"
@@ -298,7 +298,7 @@ def test_the_relative_fall_counts_air_drag_at_every_speed(tmp_path):
         certificates.build_proof_task(load(path))
 
 
-@killed_by("cli/certificates.py", "_speeds(task.over, low)).max()", "_speeds(task.over, low)).min()")
+@killed_by("design/findings.py", "speeds_of_box(task.over, low)).max()", "speeds_of_box(task.over, low)).min()")
 @pytest.mark.slow
 def test_the_greatest_fall_is_at_one_end_of_the_speeds(tmp_path, monkeypatch):
     path = tmp_path / "vehicle.toml"
@@ -311,7 +311,7 @@ def test_the_greatest_fall_is_at_one_end_of_the_speeds(tmp_path, monkeypatch):
     path.write_text(continuous)
     task, proof = certificates.build_proof_task(load(path)), types.SimpleNamespace(quadratically_stable=None)
     replace_seam(monkeypatch, "certify", lambda gain, cells, spec: types.SimpleNamespace(stable=True))
-    found = certificates.find_further(task, proof)
+    found = findings.find_further(task, proof)
     np.testing.assert_allclose(found.fall, 1.01 * greatest_deceleration(55.0), rtol=1e-4)
 
 
@@ -344,7 +344,7 @@ def test_where_two_vertices_refute_at_once(tmp_path):
     assert checked(tmp_path / "c.json").returncode == 0
 
 
-@killed_by("cli/certificates.py", "fastest=True", "fastest=False")
+@killed_by("design/loop_task.py", "fastest=True", "fastest=False")
 def test_fastest_decay_and_least_cost_of_a_gain():
     document = json.loads(run("certify", "slip-lmi", "--gain=-11753,-158.17", "--json").stdout)
     assert document["trace_cost"] == pytest.approx(1847633.09, rel=1e-5)
@@ -363,7 +363,7 @@ def test_a_verdict_is_no_error():
 
 
 @killed_by("cli/design.py", "        if reason:\n            console.c", "        if False:\n            console.c")
-@killed_by("cli/certificates.py", '"damping": (spec.damping > 0,', '"damping": (False,')
+@killed_by("design/findings.py", '"damping": (spec.damping > 0,', '"damping": (False,')
 @pytest.mark.parametrize(
     ("change", "said"),
     [("design.decay=500", "decay = 500 1/s is disproved"), ("design.damping=0.95", "damping = 0.95 is undecided")],
@@ -382,7 +382,7 @@ def test_specifications_that_are_proved():
     assert document["decay_rate"] > 50
 
 
-@killed_by("cli/certificates.py", '[] if stable else [f"quad', '[] if stable is not False else [f"quad')
+@killed_by("design/findings.py", '[] if stable else [f"quad', '[] if stable is not False else [f"quad')
 def test_undecided_is_not_proved(tmp_path, monkeypatch):
     replace_seam(monkeypatch, "certify", lambda gain, polytope, *_, **__: Certificate(polytope, gain, ()))
     result = run("certify", "slip-lmi", "--json", "--out", tmp_path / "c.json", status=1)
@@ -404,7 +404,7 @@ def test_sampled_loop_behind_a_delay():
 
 
 @killed_by(
-    "cli/certificates.py",
+    "design/loop_task.py",
     "    if not isinstance(controller, ProportionalFeedback) or not isinstance(reduced.model, SlipModel):",
     "    if True:",
 )

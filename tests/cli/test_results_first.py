@@ -70,8 +70,8 @@ def test_margins_that_cannot_be_drawn_are_shown(tmp_path, monkeypatch):
 
 @killed_by(
     "cli/design.py",
-    "with console.show_before_errors(lambda: _show(certificates.",
-    "with (lambda x: console.contextlib.nullcontext())(lambda: _show(certificates.",
+    "with console.show_before_errors(lambda: _show(document(), task, as_json)):\n                    proof.save(file)",
+    "proof.save(file)",
 )
 def test_a_certificate_that_cannot_be_saved_is_shown(tmp_path, monkeypatch):
     pytest.importorskip("cvxpy")

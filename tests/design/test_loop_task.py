@@ -1,0 +1,38 @@
+"""A loop as linear systems: the greatest decelerations, and loops whose gain has no permitted fall of the speed."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mutants import killed_by
+
+from diffabs.design import findings
+from diffabs.design.loop_task import greatest_decelerations
+from diffabs.plants import RoadVehicle
+from diffabs.roads import MagicFormula
+
+
+@killed_by("design/loop_task.py", "MARGIN * np.max(", "np.max(")
+@killed_by("design/loop_task.py", "jnp.max(every", "jnp.min(every")
+@killed_by("design/loop_task.py", "itertools.product(*inside.values())", "[[ends[1] for ends in inside.values()]]")
+def test_the_lightest_vehicle_brakes_hardest() -> None:
+    """The peak of friction, with air drag and rolling resistance, and 1 % more."""
+    speeds = np.array([5.0, 55.0])
+    plant = RoadVehicle(road=MagicFormula(D=0.3))
+    bounds = greatest_decelerations(plant, {"plant.mass": (400.0, 500.0), "speed": (5.0, 55.0)}, speeds)
+    exact = (4316.4 * 0.3 + 0.856 * speeds**2) / 400.0 + 0.01 * 9.81
+    np.testing.assert_allclose(bounds, 1.01 * exact, rtol=1e-4)
+
+
+@killed_by("design/findings.py", "if not 0 < low < high or task", "if task")
+@killed_by("design/findings.py", " or task.polytope.period is not None", "")
+@pytest.mark.parametrize(("over", "period"), [({}, None), ({"speed": (5.0, 5.0)}, None), ({"speed": (5.0, 9.0)}, 1e-3)])
+def test_a_sampled_loop_or_one_speed_has_no_permitted_fall(
+    over: dict[str, tuple[float, float]], period: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Task:
+        polytope: Any = type("Polytope", (), {"period": period})
+
+    Task.over = over  # pyright: ignore
+    monkeypatch.setattr(findings, "greatest_decelerations", lambda *_: pytest.fail("computed a fall"))
+    assert findings.permitted_speed_fall(Task()) is None  # pyright: ignore
