@@ -120,6 +120,11 @@ def describe_source(scenario: Scenario) -> JsonObject:
     return {"scenario": scenario.name, "model": describe_model(scenario), "made": describe_run()}
 
 
+def document(scenario: Scenario, values: JsonObject, *packages: str) -> JsonObject:
+    """Return the JSON document of a result: its source, its values, the versions of `packages`, and no files yet."""
+    return {**describe_source(scenario), **values, "versions": provenance.versions(*packages), "files": {}}
+
+
 def escape_unencodable_output() -> None:
     """Make stdout write escapes in place of characters that its encoding lacks, as stderr does."""
     if isinstance(sys.stdout, io.TextIOWrapper):

@@ -15,6 +15,7 @@ from diffabs.cli import certificates, console, prove, show, targets
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
 from diffabs.runtime import provenance
+from diffabs.scenario import proving
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def design(
                 if as_json:
                     show.as_json(certificates.proof_document(setup, task, reason=str(error)))
                 console.fail(f"{setup.name}: {error}", console.FAILED)
-            numbers = {name: getattr(solution, name) for name in (*certificates.FROM_DESIGN, "trace_cost")}
+            numbers = {name: getattr(solution, name) for name in (*proving.FROM_DESIGN, "trace_cost")}
             document = functools.partial(certificates.proof_document, setup, task, solution.certificate, **numbers)
             if file:
                 with console.show_before_errors(lambda: _show(document(), task, as_json)):

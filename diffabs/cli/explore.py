@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from diffabs.cli import console, prove, tuning_task
+from diffabs.cli import console, prove
 from diffabs.config.values import ScenarioError
 from diffabs.runtime import interrupt
+from diffabs.scenario.proving import certify_result
 from diffabs.scenario.scenario import Scenario
+from diffabs.scenario.tuning import build_work
 
 if TYPE_CHECKING:
     from diffabs.explore.session import ProofVerdict, Session
@@ -99,7 +101,7 @@ def prove_scenario(scenario: Scenario) -> "ProofVerdict":
     """
     from diffabs.explore.session import CERTIFIED, NOT_PROVED, REFUTED, UNDECIDED, ProofVerdict
 
-    outcome = tuning_task.certify_result(scenario)
+    outcome = certify_result(scenario)
     sentence = outcome.sentence.partition(": ")[2]
     if not outcome.certified:
         return ProofVerdict(NOT_PROVED, sentence)
@@ -112,7 +114,7 @@ def pose_tuning(scenario: Scenario) -> "TuningTask":
     from diffabs.explore.tuning import TuningTask
 
     try:
-        work = tuning_task.build_work(scenario)
+        work = build_work(scenario)
     except ModuleNotFoundError as error:
         raise ScenarioError(str(error)) from None
     return TuningTask(work.batch, list(work.constraints.values()))

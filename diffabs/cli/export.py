@@ -13,9 +13,8 @@ from rich.table import Table
 from diffabs import __version__
 from diffabs.cli import console, show, tables, targets
 from diffabs.config.values import ScenarioError
+from diffabs.controllers import Sampled, SampledOnGrid
 from diffabs.core.types import PyTree
-from diffabs.core.units import units_of
-from diffabs.core.validity import find_problems
 from diffabs.runtime.provenance import versions
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.types import FixedStep
@@ -102,17 +101,14 @@ def export(
 
 
 def _sample_controller(scenario: Scenario, period: float) -> Scenario:
-    """Return the scenario with its controller sampled. Raises ScenarioError."""
-    from diffabs.controllers import Sampled, SampledOnGrid
+    from diffabs.export import sample_controller
 
-    inner = scenario.loop.controller
-    if isinstance(inner, Sampled | SampledOnGrid):
+    if isinstance(scenario.loop.controller, Sampled | SampledOnGrid):
         raise ScenarioError("--period: the scenario's controller is sampled; change it with --set controller.period=")
-    controller = Sampled(controller=inner, period=period)
-    if lines := list(find_problems(controller, "controller.", units_of(scenario.loop.plant))):
-        raise ScenarioError("; ".join(lines))
-    loop = dataclasses.replace(scenario.loop, controller=controller)
-    return dataclasses.replace(scenario, loop=loop)
+    try:
+        return dataclasses.replace(scenario, loop=sample_controller(scenario.loop, period))
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None
 
 
 def _function_prefix(scenario: Scenario, out: pathlib.Path | None) -> str:

@@ -3,11 +3,9 @@
 It needs the extra `tune`. Modules that need it are imported only when the command runs.
 """
 
-import dataclasses
 import functools
-import math
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -16,28 +14,21 @@ import typer
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.config.values import ScenarioError, format_given, read_number_in_range, unknown_name_error
 from diffabs.core.pytree import ParameterSpec, get, parameters
-from diffabs.core.types import JsonObject, PyTree
-from diffabs.runtime import provenance
+from diffabs.core.types import JsonObject
 from diffabs.scenario import section_tune, toml
 from diffabs.scenario.measurements import Readings, read_measurements
 from diffabs.scenario.parameter_paths import flatten_table
 from diffabs.scenario.scenario import Scenario, dump
-from diffabs.simulate.types import Solver
 
 if TYPE_CHECKING:
     from diffabs.identify.fit import Identified
 
 HIGH_CORRELATION = 0.95
-ROUNDS = 3  # fits; each estimates unknown noise from the residuals of the previous fit
-MIN_RELATIVE_NOISE = 1e-6  # of a column's spread: a lower bound of estimated noise
-MAX_DATA_ROWS = 20_000  # of a simulated trajectory
 DEPENDENT = {"slip", "speed", "wheel_speed"}
 REDUNDANT = (
     "slip, speed and wheel_speed depend on each other; together they make the standard deviations too small; choose"
     " columns with --column"
 )
-FILE_ROUNDING = 1e-11  # relative, of an instant in a file of `simulate --csv`
-SPARE = 2  # extra steps, so that the run covers the last instant of the data
 
 
 def identify(
@@ -199,6 +190,8 @@ def _fit_with_progress(
     fixed_noise: Mapping[str, float],
 ) -> tuple["Identified", dict[str, float], bool]:
     """Return the fit, its standard deviations by column, and True if Ctrl-C ended it."""
+    from diffabs.identify.noise import identify_with_noise
+
     far: list[str] = []
 
     def report_progress(evaluations: int, cost: float) -> None:
@@ -206,74 +199,15 @@ def _fit_with_progress(
 
     ending = console.InterruptibleEnd("the evaluation in hand", nothing=lambda: not far)
     fit, noise = console.run_with_progress(
-        lambda: _fit(scenario, readings, ranges, fixed_noise, report_progress, ending),
+        lambda: identify_with_noise(
+            scenario.loop, readings.t, readings.columns, ranges,
+            solver=scenario.solver, sigma=fixed_noise, progress=report_progress, stopping=ending,
+        ),
         f"identifying {scenario.name}",
         lambda: far[-1] if far else progress.COMPILING,
         ending,
-    )
+    )  # fmt: skip
     return fit, noise, ending.is_requested
-
-
-def _fit(
-    scenario: Scenario,
-    readings: Readings,
-    ranges: Mapping[str, section_tune.Ends | None],
-    fixed_noise: Mapping[str, float],
-    on_progress: Callable[[int, float], None],
-    stopping: Callable[[], bool],
-) -> tuple["Identified", dict[str, float]]:
-    """Return the fit, and its standard deviations by column. Raises ValueError.
-
-    An unknown deviation starts as the spread of its column. It then becomes the root mean square of the column's
-    residuals, over `ROUNDS` fits in all.
-    """
-    from diffabs.identify.identification import identify
-    from diffabs.identify.traces import Traces
-
-    (solver, t), columns = _match_times(scenario.solver, readings.t), readings.columns
-
-    def fit_traces(
-        noise: Mapping[str, float], starts: Sequence[PyTree] = (), absolute: bool = bool(fixed_noise)
-    ) -> tuple["Identified", dict[str, np.ndarray]]:
-        traces = Traces(t=t, columns=columns, sigma=noise)
-        options = {"solver": solver, "absolute": absolute, "starts": starts}
-        fit = identify(scenario.loop, traces, dict(ranges), **options, progress=on_progress, stopping=stopping)
-        return fit, traces.residuals(fit)
-
-    spread = {name: float(np.std(values)) or 1.0 for name, values in columns.items()}
-    noise = {**spread, **fixed_noise}
-    fit, residuals = fit_traces(noise)
-    evaluations = fit.evaluations
-    # Weights by residuals change the fit, and the fit its residuals: iterate a few times from the last values.
-    for _ in range(0 if len(fixed_noise) == len(columns) else ROUNDS - 1):
-        if stopping():
-            break
-        noise_floors = {name: MIN_RELATIVE_NOISE * size for name, size in spread.items()}
-        residual_noise = {name: _root_mean_square(values) for name, values in residuals.items()}
-        noise = {name: fixed_noise.get(name) or max(residual_noise[name], noise_floors[name]) for name in columns}
-        # Residuals below the bound are errors of the solver and of the search, not noise: they do not scale the bound.
-        exact = any(residual_noise[name] < noise_floors[name] for name in columns if name not in fixed_noise)
-        # A value at an end of its range cannot be moved from there: the scenario's own values are the start again.
-        fit, residuals = fit_traces(noise, [] if fit.ends else [fit.values], bool(fixed_noise) or exact)
-        evaluations += fit.evaluations
-    return dataclasses.replace(fit, evaluations=evaluations), noise
-
-
-def _match_times(solver: Solver, t: np.ndarray) -> tuple[Solver, np.ndarray]:
-    """Return a solver whose whole steps cover the instants `t`, but not more steps than the given solver's, and `t`.
-
-    The solver keeps at most `MAX_DATA_ROWS` instants. The last instant becomes its end if it exceeds that only by the
-    rounding of a file.
-    """
-    steps = min(math.ceil(float(t[-1]) / solver.step) + SPARE, solver.steps)
-    end = steps * solver.step
-    solver = dataclasses.replace(solver, duration=end, every=max(1, math.ceil(steps / MAX_DATA_ROWS)))
-    # A file has an instant in 12 digits, and the product of the steps may be less than the duration by a rounding.
-    return solver, np.where(t <= end * (1 + FILE_ROUNDING), np.minimum(t, end), t)
-
-
-def _root_mean_square(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def _result(
@@ -285,8 +219,7 @@ def _result(
 ) -> JsonObject:
     """Return the JSON document."""
     uncertainty = fit.uncertainty
-    return {
-        **console.describe_source(scenario),
+    values = {
         "data": {"samples": len(readings.t), "columns": list(readings.columns), "until": float(readings.t[-1])},
         "values": _scalar_values(scenario, ranges, fit),
         "correlations": [
@@ -310,9 +243,8 @@ def _result(
         "reason": fit.reason.value,
         "evaluations": fit.evaluations,
         "parameters": {path: np.asarray(v, float).tolist() for path, _, v in parameters(fit.part)},
-        "versions": provenance.versions("optax", "scipy"),
-        "files": {},
     }
+    return console.document(scenario, values, "optax", "scipy")
 
 
 def _scalar_values(
@@ -342,11 +274,13 @@ def _residuals(
     readings: Readings, fit: "Identified", noise: Mapping[str, float], units: Mapping[str, str]
 ) -> dict[str, JsonObject]:
     """Return statistics of simulated minus measured, by column."""
+    from diffabs.identify.noise import root_mean_square
+
     each = np.split(np.asarray(fit.residuals), len(readings.columns))
     return {
         name: {
             "sigma": noise[name],
-            "rms": _root_mean_square(values),
+            "rms": root_mean_square(values),
             "mean": float(np.mean(values)),
             "largest": float(np.max(np.abs(values))),
             "unit": units[name],

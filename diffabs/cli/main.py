@@ -24,7 +24,6 @@ from diffabs.cli import (
     catalogue,
     compare,
     compile,
-    compiled,
     console,
     design,
     explore,
@@ -41,14 +40,15 @@ from diffabs.cli import (
     tune,
     usage,
 )
-from diffabs.cli.checking import check_run_accuracy, describe_check, describe_loose_metrics
+from diffabs.config.values import ScenarioError
 from diffabs.core import jax_flags
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Key, Scalar
 from diffabs.objectives import at_limits
-from diffabs.runtime import interrupt, provenance
+from diffabs.runtime import compilation_cache, interrupt, provenance
 from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
+from diffabs.simulate.checking import check_run_accuracy, describe_check, describe_loose_metrics
 from diffabs.simulate.faults import describe_faults
 from diffabs.simulate.matlab import write_mat
 from diffabs.simulate.run import measure, rollout
@@ -100,7 +100,7 @@ def setup(
 ) -> None:
     """Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers."""
     del version
-    compiled.use_compilation_cache()
+    compilation_cache.use_compilation_cache()
     jax.config.update("jax_enable_x64", True)
     for flag, value in JAX_FLAGS.items():
         jax.config.update(f"jax_{flag}", value)
@@ -156,9 +156,7 @@ def simulate(
                 lambda: _run(setup, key, keep=keeps_trajectory), f"simulating {setup.name}"
             )
             accuracy = (
-                console.run_with_progress(lambda: check_run_accuracy(setup, key), "shortening the step")
-                if check
-                else None
+                console.run_with_progress(lambda: _check_accuracy(setup, key), "shortening the step") if check else None
             )
             lines = describe_check(accuracy) if accuracy else _find_loose_metrics(setup, run, key, keeps_trajectory)
             result = _result(setup, run, limited)
@@ -242,6 +240,13 @@ def _find_loose_metrics(scenario: Scenario, run: Run, key: Key, keep: bool) -> l
     return describe_loose_metrics(
         run.metrics, solver, lambda other: _run(dataclasses.replace(scenario, solver=other), key, keep)[0]
     )
+
+
+def _check_accuracy(scenario: Scenario, key: Key) -> JsonObject:
+    try:
+        return check_run_accuracy(scenario.loop, scenario.solver, scenario.objectives, key)
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None
 
 
 def _draw(scenario: Scenario, run: Run, picture: pathlib.Path) -> None:

@@ -15,9 +15,10 @@ import typer
 
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.cli import engine as engines
-from diffabs.cli.tuning_task import Work, build_work, certify_result, tuning_document, without_certificate
 from diffabs.core.types import JsonObject, Part
+from diffabs.scenario.proving import Proved, certify_result, without_certificate
 from diffabs.scenario.scenario import Scenario, dump
+from diffabs.scenario.tuning import Work, build_work, describe_tuning
 from diffabs.simulate.run import rollout
 from diffabs.simulate.types import Trajectory
 
@@ -96,11 +97,16 @@ def _tune_and_document(work: Work, engine: str) -> tuple["Tuned", JsonObject, st
     after = work.scenario.with_loop(tuned.loop, "tuned")
     try:
         proved = console.run_with_progress(lambda: certify_result(after), "certifying the result")
-        result = console.run_with_progress(lambda: tuning_document(work, tuned, proved), "comparing before and after")
+        result = console.run_with_progress(lambda: _document(work, tuned, proved), "comparing before and after")
     except KeyboardInterrupt:
         interrupted, proved = True, without_certificate("interrupted")
-        result = _without_proof(work, tuning_document(work._replace(task=None), tuned, proved))
+        result = _without_proof(work, _document(work._replace(task=None), tuned, proved))
     return tuned, {**result, "interrupted": interrupted}, proved.sentence
+
+
+def _document(work: Work, tuned: "Tuned", proved: Proved) -> JsonObject:
+    packages = ("optax", "scipy", *(("cvxpy", "clarabel") if proved.certified else ()))
+    return console.document(work.scenario, describe_tuning(work, tuned, proved), *packages)
 
 
 def _draw_unless_interrupted(work: Work, tuned: "Tuned", picture: pathlib.Path, interrupted: bool) -> JsonObject:

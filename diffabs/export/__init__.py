@@ -6,4 +6,5 @@ from diffabs.export.device import NotExported as NotExported
 from diffabs.export.device import computer_program as computer_program
 from diffabs.export.difference_equations import difference_equations as difference_equations
 from diffabs.export.mockup import build_fmu as build_fmu
+from diffabs.export.sampling import sample_controller as sample_controller
 from diffabs.export.structured_text import structured_text as structured_text

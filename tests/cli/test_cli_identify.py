@@ -18,7 +18,6 @@ from diffabs.identify.fit import Identified
 from diffabs.identify.uncertainty import uncertainty
 from diffabs.scenario.measurements import read_measurements
 from diffabs.scenario.scenario import ScenarioError, load
-from diffabs.simulate.types import FixedStep
 from diffabs.tune import Reason
 
 KEYS = [
@@ -166,7 +165,7 @@ def test_the_arguments_reach_the_fit(small, csv, invented):
     assert asked["solver"].duration == pytest.approx(0.302)
 
 
-@killed_by("cli/identify.py", "max(residual_noise[name], noise_floors[name])", "spread[name]")
+@killed_by("identify/noise.py", "max(residual_noise[name], noise_floors[name])", "spread[name]")
 def test_noise_that_is_not_known_is_taken_from_the_residuals(small, csv, invented):
     document = json.loads(run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, "--json").stdout)
     first, *others = (asked["data"].sigma for asked in invented)
@@ -245,7 +244,7 @@ def test_what_simulate_wrote_is_found_again(small, tmp_path):
 
 
 @pytest.mark.slow
-@killed_by("cli/identify.py", "[] if fit.ends else [fit.values]", "[fit.values]")
+@killed_by("identify/noise.py", "[] if fit.ends else [fit.values]", "[fit.values]")
 def test_a_value_at_an_end_of_its_range_has_no_deviation(small, tmp_path):
     run("simulate", small, "--csv", tmp_path / "run.csv", "--set", "plant.mass=5")
     args = ("--data", tmp_path / "run.csv", "--column", "slip", "--free", "plant.mass=5.2:8")
@@ -304,32 +303,6 @@ def test_without_the_extra(small, csv, monkeypatch):
     result = run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, status=2)
     assert_one_error_line(result)
     assert 'pip install ".[tune]" in a clone' in result.stderr
-
-
-def test_a_trajectory_is_as_long_as_the_data(small, csv):
-    solver, readings = load(small).solver, read_measurements(csv(HEADER, *ROWS), UNITS)
-    assert commands_identify._match_times(solver, readings.t)[0].steps == 302
-    long, _ = commands_identify._match_times(FixedStep(1e-6, 1.0), readings.t)
-    assert long.steps == 300_002
-    assert long.every == 16
-    assert commands_identify._match_times(FixedStep(0.1, 0.3), readings.t)[0].duration == pytest.approx(0.3)
-
-
-@killed_by("cli/identify.py", "end * (1 + FILE_ROUNDING)", "end", case="product")
-@killed_by("cli/identify.py", "np.minimum(t, end)", "t")
-@pytest.mark.parametrize(
-    ("step", "duration"), [(3e-4, 3.0), (2 / 3, 2 / 3), (5 / 3, 5 / 3)], ids=["product", "thirds", "five thirds"]
-)
-def test_the_last_instant_of_a_file_is_in_the_run(step, duration):
-    """10,000 times 3e-4 is less than 3, and a file has 1.66666666667 for five thirds."""
-    last = float(f"{duration:.12g}")
-    solver = FixedStep(step, duration)
-    found, t = commands_identify._match_times(solver, np.array([0.0, last]))
-    assert t[1] == pytest.approx(last, rel=1e-11)
-    assert t[1] <= found.duration == pytest.approx(duration, rel=1e-15)
-    assert found.steps == solver.steps == round(duration / step)
-    found, t = commands_identify._match_times(solver, np.array([0.0, 1.01 * duration]))
-    assert t[1] > found.duration  # is refused
 
 
 @killed_by("scenario/measurements.py", "if i not in unlimited}", "}")

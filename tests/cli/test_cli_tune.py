@@ -22,10 +22,12 @@ from seams import replace_seam
 from small_scenarios import TUNE as SMALL
 
 import diffabs.tune as library
-from diffabs.cli import certificates, console, progress, tuning_task
+from diffabs.cli import certificates, console, progress
 from diffabs.cli import tune as commands_tune
 from diffabs.core.pytree import parameters, replace
 from diffabs.design.sdp import solver
+from diffabs.scenario import tuning
+from diffabs.scenario.proving import Proved
 from diffabs.scenario.scenario import load
 from diffabs.simulate.run import measure
 from diffabs.tune import DerivativeMode, Reason, StartError, Tuned
@@ -126,7 +128,7 @@ def tuned(tmp_path_factory):
     (folder / "small.toml").write_text(SMALL)
     with pytest.MonkeyPatch.context() as patch:
         replace_seam(patch, "build_proof_task", lambda chosen: pytest.fail("asked for a proof too early"))
-        replace_seam(patch, "certify_result", lambda after: tuning_task.Proved({"decay_rate": None}, "no proof"))
+        replace_seam(patch, "certify_result", lambda after: Proved({"decay_rate": None}, "no proof"))
         out = ("--out", folder / "out.toml", "--plot", folder / "a.png")
         result = run("tune", folder / "small.toml", "--json", *out)
     return folder, json.loads(result.stdout), result.stderr
@@ -334,7 +336,7 @@ def test_packaged_scenarios_can_be_tuned(name, invented):
 # What could not be done
 
 
-@killed_by("cli/tuning_task.py", '"met": beyond <= 0', '"met": True')
+@killed_by("scenario/tuning.py", '"met": beyond <= 0', '"met": True')
 def test_a_constraint_that_is_not_met_could_not_be_done(small, invented, tmp_path):
     (tmp_path / "old.toml").write_text("old")
     out = ("--out", tmp_path / "old.toml", "--plot", tmp_path / "a.png")
@@ -352,7 +354,7 @@ def test_a_constraint_that_is_not_met_could_not_be_done(small, invented, tmp_pat
     assert (tmp_path / "old.toml").read_text() == "old"
 
 
-@killed_by("cli/tuning_task.py", '"met": beyond <= 0', '"met": beyond <= 1e-3 * abs(bound)')
+@killed_by("scenario/tuning.py", '"met": beyond <= 0', '"met": beyond <= 1e-3 * abs(bound)')
 @pytest.mark.parametrize(("bound", "met"), [("0.2", True), ("0.19999999999999998", False), ("0.1999001", False)])
 def test_met_is_met_without_a_tolerance(small, invented, bound, met):
     """0.2 was reached. The float below it is not met, and the table says by how much."""
@@ -366,9 +368,9 @@ def test_met_is_met_without_a_tolerance(small, invented, bound, met):
 
 
 def test_a_limit_on_what_is_no_number_is_not_met():
-    judged = tuning_task._constraint_row("overshoot", 0.2, 0.3, math.nan, at_most=True)
+    judged = tuning._constraint_row("overshoot", 0.2, 0.3, math.nan, at_most=True)
     assert (judged["met"], judged["missed"]) == (False, None)
-    judged = tuning_task._constraint_row("certified decay", 5.0, None, None, at_most=False)
+    judged = tuning._constraint_row("certified decay", 5.0, None, None, at_most=False)
     assert (judged["met"], judged["missed"]) == (False, None)
 
 

@@ -9,7 +9,7 @@ import jax
 import pytest
 from seams import replace_seam
 
-from diffabs.cli import compiled
+from diffabs.runtime import compilation_cache as compiled
 
 
 @pytest.fixture

@@ -318,7 +318,7 @@ REFUSALS = [
 @killed_by(
     "cli/certificates.py", "    if len(values) != len(states):", "    if False:", case="certify slip-lmi --gain=1,2,3"
 )
-@killed_by("cli/certificates.py", ", reduced.model.period)", ")", case="certify slip-cured --set design.damping=")
+@killed_by("scenario/proving.py", ", reduced.model.period)", ")", case="certify slip-cured --set design.damping=")
 @killed_by(
     "cli/targets.py",
     "if os.path.isfile(source) and",

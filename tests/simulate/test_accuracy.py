@@ -12,11 +12,11 @@ from oracles import brake
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, references, sensors, stops
-from diffabs.cli.checking import describe_loose_metrics
 from diffabs.core import blocks
 from diffabs.objectives import IAE, MaxSlip, StopDistance, StopTime
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import accuracy as acc
+from diffabs.simulate.checking import describe_loose_metrics
 
 OBJECTIVES = {"stop_time": StopTime(), "stop_distance": StopDistance(), "max_slip": MaxSlip(), "iae": IAE()}
 RIG = braking(

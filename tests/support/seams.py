@@ -5,8 +5,8 @@ Tests name a seam; only this file knows where it is."""
 import pytest
 
 SEAMS = {
-    "build_proof_task": "diffabs.cli.certificates.build_proof_task",
-    "compiled_room": "diffabs.cli.compiled.ROOM",
+    "build_proof_task": "diffabs.scenario.proving.build_proof_task",
+    "compiled_room": "diffabs.runtime.compilation_cache.ROOM",
     "patience": "diffabs.cli.console.SILENCE_S",
     "second_interrupt_s": "diffabs.cli.console.SECOND_INTERRUPT_S",
     "terminal_width": "diffabs.cli.console._terminal_width",
@@ -30,7 +30,7 @@ SEAMS = {
     "solve_sdp": "diffabs.design.sdp.solver.solve_sdp",
     "design": "diffabs.design.synthesis.design",
     "members": "diffabs.explore.curves.MEMBERS",
-    "identify": "diffabs.identify.identification.identify",
+    "identify": "diffabs.identify.noise.identify",
     "max_cache_bytes": "diffabs.compiler.runtime.library_cache.MAX_CACHE_BYTES",
     "cpp_flags": "diffabs.compiler.runtime.toolchain.CPP_FLAGS",
     "probe_timeout_s": "diffabs.compiler.runtime.toolchain.PROBE_TIMEOUT_S",

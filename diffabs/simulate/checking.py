@@ -2,15 +2,15 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import numpy as np
 
-from diffabs.config.values import ScenarioError
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
 from diffabs.core.summary import format_metric
 from diffabs.core.types import JsonObject, Key, Params
-from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.accuracy import estimate_accuracy, incomparability_reasons, needs_key
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.run import run_unchecked
@@ -23,8 +23,8 @@ CLOSER = 16  # `rtol` of the run with adaptive steps is divided by this for the 
 LOOSE, LEAST = 100, 0.01  # a change above LOOSE * rtol * max(|metric|, LEAST) is reported
 
 
-def check_run_accuracy(scenario: Scenario, key: Key) -> JsonObject:
-    """Return the accuracy of each metric as JSON values.
+def check_run_accuracy(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: Key) -> JsonObject:
+    """Return the accuracy of each metric of a run as JSON values.
 
     The key "metrics" has a row by metric. "value" is the metric itself. "difference" and "relative" give its change by
     half steps, and "finer difference" the further change by quarter steps. "float32 difference" gives the change by
@@ -33,18 +33,17 @@ def check_run_accuracy(scenario: Scenario, key: Key) -> JsonObject:
     The keys beside it are "solvers", "comparable", "reasons", "ended alike" and "turned". If the runs are not
     comparable, "reasons" says why. "turned" names the metrics that are finite with one step, and not with another.
     """
-    solver = scenario.solver
     if FINEST * solver.duration / solver.step > MAX_SOLVER_STEPS:
         min_step = FINEST * solver.duration / MAX_SOLVER_STEPS
-        raise ScenarioError(
+        raise ValueError(
             f"solver.step = {solver.step:g} s is outside [{min_step:g}, {solver.duration:g}] s: a quarter of it takes "
             "too many steps for --check"
         )
-    why = incomparability_reasons(scenario.loop, solver, key)
-    accuracy = jax.device_get(estimate_accuracy(scenario.loop, solver, scenario.objectives, key=key))
-    single = {} if needs_key(scenario.loop) else _run_in_single_precision(scenario)
+    why = incomparability_reasons(loop, solver, key)
+    accuracy = jax.device_get(estimate_accuracy(loop, solver, objectives, key=key))
+    single = {} if needs_key(loop) else _run_in_single_precision(loop, solver, objectives)
     metrics = {}
-    for name in scenario.objectives:
+    for name in objectives:
         estimate = accuracy.estimates[name]
         value, low = float(estimate.value), single.get(name)
         metrics[name] = {
@@ -104,11 +103,11 @@ def describe_check(accuracy: JsonObject) -> list[str]:
     return [*lines, *(f"{name} {never}" for name in accuracy["turned"])]
 
 
-def _run_in_single_precision(scenario: Scenario) -> dict[str, float]:
+def _run_in_single_precision(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> dict[str, float]:
     """Return the metrics in single precision. The loop has no noise: single precision would draw another noise."""
     with jax.enable_x64(False):
-        loop, objectives = jax.tree.map(lambda x: np.asarray(x, np.float32), (scenario.loop, dict(scenario.objectives)))
-        return {name: float(x) for name, x in run_unchecked(loop, scenario.solver, objectives, None, 0).metrics.items()}
+        loop, objectives = jax.tree.map(lambda x: np.asarray(x, np.float32), (loop, dict(objectives)))
+        return {name: float(x) for name, x in run_unchecked(loop, solver, objectives, None, 0).metrics.items()}
 
 
 def _relative_change(difference: float, value: float) -> float:

@@ -1,16 +1,15 @@
-"""The task of a tuning, the certificate of its result, and the JSON document of both."""
+"""The task of a tuning, and the JSON values of its result."""
 
-import dataclasses
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from diffabs.cli import certificates, console
 from diffabs.config.values import ScenarioError
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import JsonObject, Part, Scalar
-from diffabs.runtime import provenance
+from diffabs.scenario import proving
+from diffabs.scenario.proving import Proved
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.admissible import first_refusal
 
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
     from diffabs.tune import Batch, Tuned
 
 WHEN = ("before", "after")
-OF_THE_COMMAND = ("scenario", "model", "made", "versions", "files")  # keys of a certificate that the tuning has too
-BOUND_ROUNDING = 1e-9  # relative; rounding of a decay rate that is proved as a factor per period is smaller
 
 
 class Work(NamedTuple):
@@ -39,22 +36,6 @@ class Work(NamedTuple):
     task: "ProofTask | None"
 
 
-class Proved(NamedTuple):
-    """The outcome of an attempt to prove something about a tuned loop.
-
-    Attributes:
-        document: JSON values of the certificate. Without a certificate they are null, and "reason" tells why.
-        sentence: Result, or the reason for no certificate.
-        task: Linear systems of the proof; None without a certificate.
-        certified: True if there is a certificate, even one without a proved property.
-    """
-
-    document: JsonObject
-    sentence: str
-    task: "ProofTask | None" = None
-    certified: bool = False
-
-
 def build_work(scenario: Scenario) -> Work:
     """Return the runs and constraints of a tuning."""
     from diffabs.tune import AtMost, CertifiedDecay, Poles
@@ -64,7 +45,7 @@ def build_work(scenario: Scenario) -> Work:
     if line := first_refusal(scenario.loop, batch.values, scenario.solver):
         raise ScenarioError(f"tune.over: {line}")
     constraints: JsonObject = {name: AtMost(metric=name, bound=bound) for name, bound in goal.limits.items()}
-    task = certificates.build_proof_task(scenario) if goal.decay or goal.damping else None
+    task = proving.build_proof_task(scenario) if goal.decay or goal.damping else None
     if task and goal.decay:
         constraints["certified decay"] = CertifiedDecay(task.polytope, goal.decay)
     if task and goal.damping:
@@ -72,43 +53,10 @@ def build_work(scenario: Scenario) -> Work:
     return Work(scenario, batch, constraints, task)
 
 
-def certify_result(after: Scenario) -> Proved:
-    """Return the outcome of a proof for the tuned loop over the ranges of [design].
-
-    The certificate has the fastest decay rate that is found. If [tune] requires a faster one, it has that one if it can
-    be proved. Without a certificate the outcome gives the reason; no error is raised.
-    """
-    from diffabs.design import findings
-
-    decay = after.tune.decay
-    try:
-        task = certificates.build_proof_task(after)
-        proof = task.certify()
-        if (proof.decay_rate or 0.0) < decay:  # the search for the fastest decay ends slightly below the optimum
-            faster_proof = task.certify(dataclasses.replace(task.spec, decay=decay * (1 + BOUND_ROUNDING)))
-            proof = faster_proof if (faster_proof.decay_rate or 0.0) >= decay else proof
-    except (ModuleNotFoundError, ValueError, np.linalg.LinAlgError) as error:
-        return without_certificate(" ".join(str(error).split()))
-    further = findings.find_further(task, proof)
-    reason = findings.describe_unproved(proof, task.spec, further) or None
-    document = certificates.proof_document(after, task, proof, reason=reason, further=further)
-    document = {key: value for key, value in document.items() if key not in OF_THE_COMMAND}
-    rate = document["decay_rate"]
-    over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())
-    sentence = reason or f"quadratically stable over {over}, decay rate {rate:.4g} 1/s"
-    return Proved(document, f"certificate: {sentence}", task, certified=True)
-
-
-def without_certificate(why: str) -> Proved:
-    """Return the outcome of a proof that gave no certificate."""
-    return Proved({**dict.fromkeys(certificates.FROM_PROOF), "reason": why}, f"no certificate: {why}")
-
-
-def tuning_document(work: Work, tuned: "Tuned", proved: Proved) -> JsonObject:
-    """Return the whole document, without the written files."""
+def describe_tuning(work: Work, tuned: "Tuned", proved: Proved) -> JsonObject:
+    """Return the JSON values of a tuning and of the proof about its result."""
     scenario, goal = work.scenario, work.scenario.tune
     return {
-        **console.describe_source(scenario),
         "lanes": work.batch.size,
         "free": {path: _free(scenario, tuned, path) for path in goal.free},
         "objective": dict(zip(WHEN, map(float, tuned.objective), strict=True)),
@@ -127,8 +75,6 @@ def tuning_document(work: Work, tuned: "Tuned", proved: Proved) -> JsonObject:
         ],
         "parameters": {path: _plain(value) for path, _, value in parameters(tuned.loop)},
         "certificate": proved.document,
-        "versions": provenance.versions("optax", "scipy", *(("cvxpy", "clarabel") if proved.certified else ())),
-        "files": {},
     }
 
 
