@@ -2,7 +2,7 @@
 
 Bearing friction is identified from four coasting curves, the seven parameters of `FREE` from experiment 1. Experiment 2
 judges the result. Three braking runs with one step of the command each (Fig. 5.6 a) judge both rigs once more.
-`experiments/measured_rig.py` shows how the model was chosen, and what the identified rig means for the controllers.
+`experiments/measured_rig/run.py` shows how the model was chosen, and what the identified rig means for the controllers.
 """
 
 import dataclasses

@@ -23,7 +23,7 @@ from diffabs.design.sdp import solver
 from diffabs.linear.linearization import StateSpace
 from diffabs.scenario.scenario import load
 
-CHECKER = ROOT / "experiments" / "check_certificate.py"
+CHECKER = ROOT / "tests" / "support" / "check_certificate.py"
 KEYS = [
     *(
         "scenario",

@@ -26,7 +26,7 @@ from diffabs.design.proof.certificate import Certificate, Claim
 from diffabs.design.spec import L2Gain, Spec
 from diffabs.design.verify import verify_file
 
-OUTSIDERS = ROOT / "experiments" / "check_certificate.py"
+OUTSIDERS = ROOT / "tests" / "support" / "check_certificate.py"
 spec = importlib.util.spec_from_file_location("check_certificate", OUTSIDERS)
 outsiders = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(outsiders)

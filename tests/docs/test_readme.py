@@ -31,13 +31,13 @@ FIRST = re.findall(r"^    diffabs (.*?)(?: {2,}#.*)?$", TEXT, re.MULTILINE)
 TABLE = re.findall(r"\| `([^`]+)` \|$", TEXT, re.MULTILINE)
 ELSEWHERE = {  # commands of the table that other tests execute; a study with fewer runs
     "diffabs prove": "tests/cli/test_cli_prove.py::test_the_command_of_the_readme_proves_the_cured_loop",
-    "python experiments/cure_overshoot.py": (
+    "python experiments/overshoot_cured/run.py": (
         "tests/experiments/test_experiments.py::test_the_cure_holds_at_its_corners_and_not_beyond"
     ),
-    "python experiments/best_slip.py": (
+    "python experiments/best_slip/run.py": (
         "tests/references/test_best_slip.py::test_no_rule_beats_the_bound_and_tuning_shortens"
     ),
-    "python experiments/lq_weights.py": (
+    "python experiments/lq_weights/run.py": (
         "tests/experiments/test_experiments.py::test_gradients_need_fewer_rollouts_than_searches_without"
     ),
 }

@@ -1,29 +1,21 @@
-"""The adversary of experiments/adversary.py: his set, what moves in it, and what was found, by other programs."""
+"""The adversary of experiments/adversary: his set, what moves in it, and what was found, by other programs."""
 
-import sys
+import importlib
 import types
 
 import numpy as np
 import pytest
-from project import ROOT
 from scipy.optimize import linprog
 
 pytest.importorskip("cma")
 pytestmark = pytest.mark.usefixtures("users_engine")
-FOLDER = ROOT / "experiments"
-NAMES = ("set", "ascent", "attack", "loops", "search", "check", "minmax")
+NAMES = ("bounds", "ascent", "attack", "loops", "search", "check", "minmax")
 
 
 @pytest.fixture(scope="module")
 def adversary():
-    """The experiment's modules by their last names."""
-    before = set(sys.modules)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(FOLDER)
-        yield {name: __import__(f"adversary_{name}") for name in NAMES}
-    for name in set(sys.modules) - before:
-        if name.startswith(("adversary", "real_rig")):
-            sys.modules.pop(name)
+    """The experiment's modules by name."""
+    return {name: importlib.import_module(f"experiments.adversary.{name}") for name in NAMES}
 
 
 def inside(bounds, z):
@@ -37,7 +29,7 @@ def inside(bounds, z):
 
 def test_every_search_moves_within_the_set(adversary):
     """Any numbers are brought into it; what is in it stays, so that nothing in it is out of reach."""
-    module, random = adversary["set"], np.random.default_rng(3)
+    module, random = adversary["bounds"], np.random.default_rng(3)
     bounds = module.Bounds()
     assert bounds.size == 124
     wild = random.normal(size=(50, bounds.size)) * np.exp(random.uniform(-3, 3, (50, 1)))
@@ -59,7 +51,7 @@ def test_every_search_moves_within_the_set(adversary):
 @pytest.mark.parametrize("slope", [0.15, 0.11])
 def test_the_farthest_road_is_that_of_a_linear_program(adversary, slope):
     """SciPy's; at 0.11/m two bounds are no whole number of steepest slopes apart."""
-    bounds = adversary["set"].Bounds(slope=slope)
+    bounds = adversary["bounds"].Bounds(slope=slope)
     slopes = np.random.default_rng(4).normal(size=(4, bounds.size))
     found = adversary["ascent"].farthest(bounds, slopes)
     n, steepest = bounds.factors, bounds.slope * bounds.spacing / bounds.height
@@ -76,7 +68,7 @@ def test_the_farthest_road_is_that_of_a_linear_program(adversary, slope):
 
 def test_the_farthest_noise_is_the_slope_made_one(adversary):
     """Its mean taken off, where no peak is in the way; one that is, stays at its bound."""
-    bounds = adversary["set"].Bounds()
+    bounds = adversary["bounds"].Bounds()
     block, slopes = bounds.blocks[1], np.zeros((2, bounds.size))
     slopes[:, block] = np.random.default_rng(5).normal(size=(2, bounds.noises))
     slopes[1, bounds.factors] = 30.0
@@ -108,7 +100,7 @@ def test_failures_are_counted_and_never_averaged_in(adversary, monkeypatch):
     monkeypatch.setattr(module, "in_the_box", lambda *_: {})
     random = np.array([0.1, nothing, 0.2, nothing, 0.6])
     attack = types.SimpleNamespace(
-        bounds=adversary["set"].Bounds(),
+        bounds=adversary["bounds"].Bounds(),
         loop=None,
         overshoots=lambda z: random[: len(z)],
         runs=lambda z: types.SimpleNamespace(metrics={"iae": np.array([0.5, 9.0])[: len(z)]}),
@@ -127,7 +119,7 @@ def test_failures_are_counted_and_never_averaged_in(adversary, monkeypatch):
 def test_an_attacked_run_is_that_of_another_program(adversary):
     """SciPy's, of an arbitrary point of the set: road, noise, mass and speed all count. And a run that does not end in
     its time is nothing that was found."""
-    module, loops = adversary["set"], adversary["loops"]
+    module, loops = adversary["bounds"], adversary["loops"]
     bounds = module.Bounds()
     z = module.drawn(bounds, 2, np.random.default_rng(6))
     z[:, bounds.blocks[2]] = [[-0.7, -0.8], [0.5, 0.6]]
@@ -146,9 +138,7 @@ def test_an_attacked_run_is_that_of_another_program(adversary):
 def test_the_experiment_runs_small(adversary, tmp_path, monkeypatch):
     """Gradients are those of differences; what they find is more than random points have; tuning against it helps."""
     pytest.importorskip("matplotlib")
-    monkeypatch.syspath_prepend(FOLDER)
-    import adversary as experiment  # pyright: ignore[reportMissingImports]
-
+    experiment = importlib.import_module("experiments.adversary.run")
     module = adversary["search"]
     rounds = adversary["minmax"].Rounds(
         rounds=1, budget=900, seeds=(1, 2), fresh=(3, 4), box=14, room=2, iterations=4, samples=128

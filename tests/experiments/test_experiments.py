@@ -1,8 +1,7 @@
 """The experiments run, small, and find what their docstrings say."""
 
-import importlib.util
+import importlib
 import json
-import sys
 import types
 from typing import NamedTuple
 
@@ -20,19 +19,14 @@ from diffabs.scenario.scenario import load
 
 pytest.importorskip("matplotlib")
 pytestmark = pytest.mark.slow
-FOLDER = ROOT / "experiments"
 
 
 def experiment(name):
-    spec = importlib.util.spec_from_file_location(f"experiments_{name}", FOLDER / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module(f"experiments.{name}")
 
 
 def test_sampled_control_agrees_with_an_independent_solution(tmp_path):
-    module = experiment("sampled_control")
+    module = experiment("slip_estimator.sampled")
     config = module.Config(periods=(1e-3,), delays=(0.0,), drawn_periods=(1e-3,), out=str(tmp_path), stop=0.05)
     result = module.main(config)
     for row, (_, time, distance) in zip(result["sweep"], config.reference, strict=True):
@@ -43,7 +37,7 @@ def test_sampled_control_agrees_with_an_independent_solution(tmp_path):
 
 
 def test_noise_blinds_the_bare_latch_and_not_the_robust_one():
-    module = experiment("sensor_noise")
+    module = experiment("slip_estimator.noise")
     config = module.Config(seeds=8)
     references = {"bare": module.PeakLatch(), "robust": module.PeakRobust()}
     car = module.CARS["Magic Formula"]
@@ -59,7 +53,7 @@ def test_noise_blinds_the_bare_latch_and_not_the_robust_one():
 
 def test_a_compliant_tyre_follows_the_rigid_one_over_its_relaxation_length():
     """With the friction of its slip it moves as the rigid rig; otherwise L m' = v (mu - m), in closed form."""
-    module = experiment("measured_rig")
+    module = experiment("measured_rig.run")
     rig = load("lab-rig-measured").loop.plant
     yielding = replace(module.as_compliant(rig), {"relaxation": 0.12})
     rigid = module.LabRigState(wheel=120.0, drum=150.0, brake=6.0, distance=1.0)
@@ -74,7 +68,7 @@ def test_a_compliant_tyre_follows_the_rigid_one_over_its_relaxation_length():
 
 
 def test_the_laboratory_rig_locks_with_the_published_gain():
-    module = experiment("lab_rig")
+    module = experiment("lab_rig.run")
     config = module.Config()
     for row in module.checks(config):
         if row["reference"] is not None:
@@ -84,8 +78,7 @@ def test_the_laboratory_rig_locks_with_the_published_gain():
 
 
 def test_one_prior_is_enough_to_identify_a_magic_formula(monkeypatch):
-    monkeypatch.syspath_prepend(FOLDER)
-    module = experiment("identification")
+    module = experiment("identification.run")
     config = module.Config()
     *_, found = module.from_prior(config, config.priors[0][1])
     time, distance = np.abs(found.residuals.reshape(-1, 2)).max(axis=0)
@@ -96,8 +89,7 @@ def test_one_prior_is_enough_to_identify_a_magic_formula(monkeypatch):
 
 
 def test_the_cure_holds_at_its_corners_and_not_beyond(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(FOLDER)
-    module = experiment("cure_overshoot")
+    module = experiment("overshoot_cured.run")
     box = module.Box(masses=(5.3, 6.2), speeds=(5.0, 50.0))
     near = {"gain": (-17300.0, -348.6), "filter": 0.01732, "iterations": 1}  # tuned from where tuning ends
     result = module.main(module.Config(out=str(tmp_path), box=box, seeds=1, **near))
@@ -117,7 +109,7 @@ def test_the_cure_holds_at_its_corners_and_not_beyond(tmp_path, monkeypatch):
 
 
 def test_the_worst_case_found_is_at_least_as_bad_as_samples(tmp_path):
-    module = experiment("worst_case")
+    module = experiment("worst_case.run")
     result = module.main(module.Config(samples=2000, starts=2, iterations=3, out=str(tmp_path)))
     for row in result["table"]:
         assert row["worst found [%]"] >= row["worst of 2000 samples [%]"]
@@ -131,8 +123,7 @@ def test_the_worst_case_found_is_at_least_as_bad_as_samples(tmp_path):
 
 def test_lanes_that_fail_are_no_part_of_a_mean(tmp_path, monkeypatch):
     """By hand: of four lanes one diverges and one does not stop, under one of the controllers; then all fail."""
-    monkeypatch.syspath_prepend(FOLDER)
-    module, cure = experiment("pid_over_roads"), experiment("cure_overshoot")
+    module, cure = experiment("pid_over_roads.run"), experiment("overshoot_cured.run")
     flags = {
         "stopped": np.array([1, 1, 1, 0], bool),
         "diverged": np.array([0, 0, 1, 0], bool),
@@ -169,7 +160,7 @@ def test_lanes_that_fail_are_no_part_of_a_mean(tmp_path, monkeypatch):
 
 
 def test_tuned_over_roads_no_wheel_locks_longer(tmp_path):
-    module = experiment("pid_over_roads")
+    module = experiment("pid_over_roads.run")
     config = module.Config(
         roads=8,
         held_out=8,
@@ -189,8 +180,7 @@ def test_tuned_over_roads_no_wheel_locks_longer(tmp_path):
 
 
 def test_gradients_need_fewer_rollouts_than_searches_without(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(FOLDER)
-    module = experiment("lq_weights")
+    module = experiment("lq_weights.run")
     config = module.Config(budgets=((2, 120),), rig_step=1e-3, repeats=1, first_steps=(0.2, 0.5), out=str(tmp_path))
     rows = {row["accuracy"]: row for row in module.main(config, ("gain",))["table"]}
     kept = json.loads((tmp_path / "gain.json").read_text())
@@ -203,8 +193,7 @@ def test_gradients_need_fewer_rollouts_than_searches_without(tmp_path, monkeypat
 
 def test_a_table_of_gains_can_be_tuned(tmp_path, monkeypatch):
     """By gradients in reverse mode, from its start on."""
-    monkeypatch.syspath_prepend(FOLDER)
-    module = experiment("lq_weights")
+    module = experiment("lq_weights.run")
     few = {"table_masses": (5.75,), "table_speeds": (9.0, 50.0, 3), "first": 0.1, "iterations": (2, 2)}
     config = module.Config(budgets=((48, 100),), repeats=1, first_steps=(0.2,), out=str(tmp_path), **few)
     for name in ("table 6", "table 24"):
@@ -216,8 +205,7 @@ def test_a_table_of_gains_can_be_tuned(tmp_path, monkeypatch):
 
 def test_what_searches_spent_is_counted(monkeypatch):
     """By hand: a bound where no search without gradients arrives, and none where the gradients do not."""
-    monkeypatch.syspath_prepend(FOLDER)
-    module = experiment("lq_weights")
+    module = experiment("lq_weights.run")
     traces = {
         "tune": [[1, 9.0], [6, 1.0]],
         "L-BFGS-B": [[1, 9.0], [5, 1.0]],
@@ -247,7 +235,7 @@ def test_what_searches_spent_is_counted(monkeypatch):
 def test_tuned_weights_recover_more_starts_and_are_proved(tmp_path):
     """24 x 24 cells know the share to some 2 %: the full run has 0.294, 0.328, 0.464 and 0.487. What any control could
     do is a strip, whose area is also counted."""
-    module = experiment("arm_weights")
+    module = experiment("two_wheeler.weights")
     config = module.Config(starts=24, proof_points=2, tuned_starts=(7, 13), out=str(tmp_path))
     found = module.main(config)
     rows = {row["weights"]: row for row in found["table"]}
@@ -267,7 +255,7 @@ def test_tuned_weights_recover_more_starts_and_are_proved(tmp_path):
 
 @pytest.mark.usefixtures("users_engine")
 def test_an_observer_recovers_nearly_what_the_whole_state_does(tmp_path):
-    module = experiment("arm_lqg")
+    module = experiment("two_wheeler.lqg")
     config = module.Config(noises=((3e-3, 3e-3),), seeds=4, multiples=(0.06, 0.09, 16), duration=6.0, out=str(tmp_path))
     full, observed = module.main(config)["table"]
     assert abs(full["multiple"] - 0.08) < 0.0021
@@ -276,8 +264,7 @@ def test_an_observer_recovers_nearly_what_the_whole_state_does(tmp_path):
 
 def test_the_bound_rises_as_the_root_of_the_motor_power(monkeypatch):
     """And the best machine for a bound is where the ranges end: long, heavy; the gear is inside."""
-    monkeypatch.syspath_prepend(FOLDER)
-    module = experiment("arm_codesign")
+    module = experiment("two_wheeler.codesign")
     config = module.Config()
     hanging = module.load("arm-hanging").loop
     found = [
@@ -297,8 +284,7 @@ def test_the_bound_rises_as_the_root_of_the_motor_power(monkeypatch):
     ],
 )
 def test_the_committed_controllers_are_judged_and_proved_again(tmp_path, monkeypatch, only, known, estimated):
-    monkeypatch.syspath_prepend(FOLDER)
-    module = experiment("real_rig_again")
+    module = experiment("real_rig.again")
     judging = module.Judging(samples=256, fewer=256, block=256, corner_seeds=1)
     found = module.main(module.Config(judging=judging, only=only, out=str(tmp_path)))
     for speed, (meets, near, corner, said) in (("known", known), ("estimated", estimated)):
@@ -323,10 +309,9 @@ def test_the_committed_controllers_are_judged_and_proved_again(tmp_path, monkeyp
 @pytest.mark.parametrize(("resistance", "watts"), [(3.0, 192.0), (1.0, 576.0), (0.3, 1800.0), (0.1, 2520.0)])
 def test_the_power_of_a_motor_knows_the_limit_of_its_current(monkeypatch, resistance, watts):
     """The greatest I (U - R I) over currents within 60 A, on a grid."""
-    monkeypatch.syspath_prepend(FOLDER)
     currents = np.linspace(0.0, 60.0, 60_001)
     assert np.max(currents * (48.0 - resistance * currents)) == pytest.approx(watts, rel=1e-9)
-    assert experiment("arm_codesign").motor_power(48.0, resistance, 60.0) == pytest.approx(watts, rel=1e-12)
+    assert experiment("two_wheeler.codesign").motor_power(48.0, resistance, 60.0) == pytest.approx(watts, rel=1e-12)
 
 
 def rows_of_page(page, first, last):
@@ -338,7 +323,6 @@ def rows_of_page(page, first, last):
 
 def test_each_row_of_machines_has_the_bound_of_its_own_machine(monkeypatch):
     """By the left eigenvector w of the unstable pole s: |w'B| U/(s |w'd|). The page has three digits of a machine."""
-    monkeypatch.syspath_prepend(FOLDER)
     plant, start = load("arm-hanging").loop.plant, np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])
     machines = rows_of_page("two-wheeler.md", "The tuned machines:", "**The paper's motor")
     bounds = rows_of_page("two-wheeler.md", "## A machine for the claim", "The machines of greatest bound")
@@ -368,7 +352,7 @@ def test_each_row_of_machines_has_the_bound_of_its_own_machine(monkeypatch):
 
 def test_drawn_designs_climb_to_where_most_is_recovered():
     """A known top, 0.5 at x = 0.7 and y = 100, where x is counted in its range and y in logarithms of its own."""
-    module = experiment("arm_draws")
+    module = experiment("two_wheeler.random_designs")
     ranges = {"x": (0.0, 1.0), "y": (1.0, 1e3)}
 
     def judge(designs, multiples):
@@ -385,7 +369,7 @@ def test_drawn_designs_climb_to_where_most_is_recovered():
 
 def test_a_design_is_judged_as_its_own_loop_would_be():
     """Two machines and two multiples in one call, and each of them alone."""
-    module, scenario = experiment("arm_draws"), load("arm-hanging")
+    module, scenario = experiment("two_wheeler.random_designs"), load("arm-hanging")
     gain = np.asarray(scenario.loop.controller.gain)
     solver, start = FixedStep(step=1e-3, duration=6.0), np.array([0.5, 0.0, 0.2])
 
@@ -435,8 +419,7 @@ def latched_stop(own, height, place, edge, width):
 
 def test_the_latch_holds_the_first_slip_on_the_second_surface(monkeypatch):
     """So it is too long where the second peak lies at another slip, and hardly where both are at one slip."""
-    monkeypatch.syspath_prepend(FOLDER)
-    module = experiment("changing_road")
+    module = experiment("slip_estimator.changing_road")
     config = module.Config(heights=(0.5,), places=(1.0, 2.0), edges=(0.5,))
     values = module.roads(config)
     found = module.excess(config, module.RULES["proposed, latch"], values)

@@ -1,9 +1,9 @@
 """The parts of the real rig, against a second version in NumPy that reads nothing but the documents it is given."""
 
 import dataclasses
+import importlib
 import itertools
 import json
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -24,12 +24,8 @@ from diffabs.roads import RIG
 @pytest.fixture(scope="module")
 def rig():
     """The experiment's modules."""
-    names = ("real_rig_box", "real_rig_loops", "real_rig_floor", "real_rig_document", "real_rig_proof")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(ROOT / "experiments")
-        yield {name.removeprefix("real_rig_"): __import__(name) for name in names}
-    for name in names:
-        sys.modules.pop(name)
+    names = ("box", "loops", "floor", "document", "proof")
+    return {name: importlib.import_module(f"experiments.real_rig.{name}") for name in names}
 
 
 CASES = {
@@ -86,7 +82,8 @@ def test_a_document_runs_elsewhere(rig, speed, case):
 
 
 SLOW = pytest.mark.slow
-COMMITTED = sorted((ROOT / "docs" / "controllers").glob("*.json"))
+FOLDER = ROOT / "experiments" / "real_rig" / "controllers"
+COMMITTED = sorted(FOLDER.glob("*.json"))
 EXAMPLES = [  # one of each kind of reference, controller and seen speed
     "estimated-tuned-cvar",
     "estimated-sliding-mode-cma-es",
@@ -115,7 +112,7 @@ CONTROLLERS = [pytest.param(path, id=path.stem, marks=() if path.stem in EXAMPLE
 @pytest.mark.parametrize("path", CONTROLLERS)
 @pytest.mark.slow
 def test_each_committed_controller_runs_elsewhere(rig, path):
-    """The documents of docs/controllers, on a rig that is not the nominal one."""
+    """The documents of the study, on a rig that is not the nominal one."""
     document = json.loads(path.read_text())
     for name, value in {"plant.mass": 6.2, "controller.delay": 7e-4, "sensor.blocks.3.deceleration": 0.08}.items():
         if name in document["parameters"]:
@@ -173,7 +170,7 @@ def test_a_failing_hull_vertex_is_no_failing_machine(rig):
     has one. Poles of machines are SciPy's."""
     proof, box = rig["proof"], rig["box"]
     names = {"published": "known-published-gain", "searched": "known-pi-cma-es"}
-    documents = {name: json.loads((ROOT / f"docs/controllers/{file}.json").read_text()) for name, file in names.items()}
+    documents = {name: json.loads((FOLDER / f"{file}.json").read_text()) for name, file in names.items()}
     ones = {name: rig["document"].loop_of(document) for name, document in documents.items()}
     found = proof.proofs(proof.Proving(cuts=1, grid=3), box.Box(), box.Fixed(), ones)
     b, low = box.Box(), 5 / 3.6

@@ -1,13 +1,12 @@
 """What can be told of a figure without looking: labels that do not touch, legends beside the data, shared axes."""
 
 import dataclasses
-import sys
+import importlib
 
 import numpy as np
 import pytest
 from marks import readable_id
 from mutants import killed_by
-from project import ROOT
 
 from diffabs import plot
 from diffabs.controllers import HoldingInput, StateFeedback
@@ -16,8 +15,6 @@ from diffabs.plants import MirroredRig
 from diffabs.plot.frequency import loop_shape
 from diffabs.references import FixedSlip
 from diffabs.scenario.defaults import braking
-
-sys.path.insert(0, str(ROOT / "experiments"))
 
 
 def boxes(axis):
@@ -85,7 +82,7 @@ def test_the_curves_of_a_loop_are_its_response():
 
 @pytest.mark.slow
 def test_the_cure_is_drawn_on_shared_axes_with_its_legend_below():
-    cure, cure_figures = (pytest.importorskip(name) for name in ("cure_overshoot", "cure_figures"))
+    cure, cure_figures = (importlib.import_module(f"experiments.overshoot_cured.{name}") for name in ("run", "figures"))
     config = cure.Config()
     loops = cure.contenders(config, cure.start(config), (-8000.0, -100.0))
     few = cure.dataclasses.replace(config, drawn=config.drawn[:2], step=1e-3, longer=0.05)
@@ -101,7 +98,7 @@ def test_the_cure_is_drawn_on_shared_axes_with_its_legend_below():
 
 @pytest.mark.slow
 def test_all_masses_are_drawn_with_the_worst_of_them():
-    cure, cure_figures = (pytest.importorskip(name) for name in ("cure_overshoot", "cure_figures"))
+    cure, cure_figures = (importlib.import_module(f"experiments.overshoot_cured.{name}") for name in ("run", "figures"))
     config = dataclasses.replace(cure.Config(), step=1e-3, duration=0.3)
     figure = cure_figures.all_masses(config, {"it": cure.start(config)})
     panel, bar = figure.axes

@@ -1,13 +1,12 @@
-"""The parts and the bound of experiments/best_slip.py, against closed forms and an independent solution."""
+"""The parts and the bound of experiments/best_slip, against closed forms and an independent solution."""
 
-import sys
+import importlib
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from mutants import killed_by
-from project import ROOT
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -15,19 +14,14 @@ import diffabs as d
 from diffabs import controllers, plants, references, roads
 from diffabs.core.protocols import BrakeOutput, Memory
 
-FOLDER = ROOT / "experiments"
-MODULES = ("best_slip_bound", "best_slip_fixed", "best_slip_rules", "best_slip_search", "best_slip")
+MODULES = ("bound", "fixed", "rules", "search", "run")
 
 
 @pytest.fixture(scope="module")
 def experiment():
     """The experiment's modules by name."""
     pytest.importorskip("matplotlib")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(FOLDER)
-        yield {name: __import__(name) for name in MODULES}
-    for name in (*MODULES, "pid_over_roads"):
-        sys.modules.pop(name, None)
+    return {name: importlib.import_module(f"experiments.best_slip.{name}") for name in MODULES}
 
 
 def seen(slip, deceleration):
@@ -162,7 +156,7 @@ def test_the_bound_is_full_torque_and_then_the_peak(experiment, mass, mu):
     road = {"B": 13.0, "C": 1.45, "D": mu, "E": -0.8}
     values = {f"plant.road.roads.{i}.{n}": np.array([x]) for i in (0, 1) for n, x in road.items()}
     values |= {"plant.mass": np.array([mass]), "initial.speed": np.array([25.0]), "plant.road.edges": np.array([[9.0]])}
-    found = experiment["best_slip_bound"].bound(values, 90.0, 0.3)
+    found = experiment["bound"].bound(values, 90.0, 0.3)
     np.testing.assert_allclose(found.distance[0], best_stop(mass, 25.0, [road], 90.0), rtol=2e-5)
     np.testing.assert_allclose(found.friction[0], 25.0**2 / (2 * 9.81 * mu), rtol=1e-12)
     assert found.weak[0] == (mu == 1.1)
@@ -171,7 +165,7 @@ def test_the_bound_is_full_torque_and_then_the_peak(experiment, mass, mu):
 
 def test_the_bound_beyond_an_edge_is_the_energy_that_is_left(experiment):
     """By hand: up to the edge as on one surface, through its width at the mean of both peaks, then at the second's."""
-    module = experiment["best_slip_bound"]
+    module = experiment["bound"]
     both = ({"B": 13.0, "C": 1.45, "D": 0.8, "E": -0.8}, {"B": 20.0, "C": 1.3, "D": 0.2, "E": 0.2})
     values = {f"plant.road.roads.{i}.{n}": np.array([x]) for i, road in enumerate(both) for n, x in road.items()}
     values |= {"plant.mass": np.array([15.0]), "initial.speed": np.array([25.0])}
@@ -188,7 +182,7 @@ def test_the_bound_beyond_an_edge_is_the_energy_that_is_left(experiment):
 def test_no_rule_beats_the_bound_and_tuning_shortens(experiment, tmp_path, monkeypatch):
     """On a few roads, with exact sensors: who knows the peak comes within a hundredth of the bound, and derivatives
     where the search ended are those of differences."""
-    main, fixed, search = (experiment[name] for name in ("best_slip", "best_slip_fixed", "best_slip_search"))
+    main, fixed, search = (experiment[name] for name in ("run", "fixed", "search"))
     config = main.Config(
         fixed=fixed.Fixed(roads=fixed.Roads(held_out=64)),
         search=search.Search(roads=32, few=16, starts=2, tried=3, iterations=3, cma_evaluations=24),
@@ -222,7 +216,7 @@ def test_no_rule_beats_the_bound_and_tuning_shortens(experiment, tmp_path, monke
 
 def test_failures_are_counted_and_never_averaged_in(experiment):
     """By hand: two lanes of four are good under both, one of the paper's does not stop, one of the rule's locks."""
-    module = experiment["best_slip_fixed"]
+    module = experiment["fixed"]
     shortest = np.array([10.0, 20.0, 40.0, 50.0])
     flags = {"stopped": np.array([True] * 4), "diverged": np.zeros(4, bool), "locked_time": np.zeros(4)}
     paper = flags | {"stop_distance": np.array([12.0, 22.0, 900.0, 55.0]), "stopped": np.array([1, 1, 0, 1], bool)}

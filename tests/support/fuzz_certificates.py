@@ -20,7 +20,7 @@ from diffabs.design.proof.certificate import Certificate, Claim
 
 ARRAYS = {"A", "B", "gain", "nodes", "P", "Q", "R", "W", "x0", "Bw", "C", "D", "limit", "points", "rates"}
 ROUNDING = 1e-7  # of the norm of a matrix, for its eigenvalues
-SHORT = ROOT / "experiments" / "check_certificate.py"
+SHORT = ROOT / "tests" / "support" / "check_certificate.py"
 
 
 def lyapunov(C, Q, discrete=False):

@@ -123,7 +123,7 @@ def main():
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int)
-    parser.add_argument("--no-outsiders", action="store_true", help="without experiments/check_certificate.py")
+    parser.add_argument("--no-outsiders", action="store_true", help="without check_certificate.py")
     parser.add_argument("-v", action="store_true", help="whole tracebacks")
     given = parser.parse_args()
     failures, tally = fuzz(given.count, given.seed, given.only, not given.no_outsiders)

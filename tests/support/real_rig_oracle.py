@@ -1,4 +1,4 @@
-"""A second version of the loops of experiments/real_rig.py, in NumPy, from a document of `real_rig_document` alone.
+"""A second version of the loops of experiments/real_rig, in NumPy, from a document of its `document.py` alone.
 
 Nothing of diffabs: the plant by Runge-Kutta's classical method, everything else by the difference equations. Noise of
 zero deviation only: the random numbers are another program's."""

@@ -539,7 +539,7 @@ class TestCoverage:
         ids=["log-normal", "exponential", "gamma", "normal", "t5"],
     )
     def test_mean(self, law, n, least, greatest):
-        """Within three standard errors of what `experiments/mean_intervals.py` measures."""
+        """Within three standard errors of what `experiments/mean_intervals/run.py` measures."""
         samples = law.rvs(size=(REPETITIONS, n), random_state=np.random.default_rng(30))
         found = coverage(lambda x: Moments.of(x).mean(), iter(samples).__next__, law.mean())
         assert least < found < greatest

@@ -14,7 +14,7 @@ The mean of a skewed sample has Hall's interval, which removes the skewness k fr
     g(y) = 3 ((1 + k (y - k/(6 n)))^(1/3) - 1)/k
 
 Each end is the outer one of Hall's and Student's. So heavy symmetric tails do not lower the coverage. 95 % intervals of
-10, 30, 100 and 1,000 samples cover, in % (`experiments/mean_intervals.py`; the brackets have Student's intervals):
+10, 30, 100 and 1,000 samples cover, in % (`experiments/mean_intervals/run.py`; the brackets have Student's intervals):
 
 - Log-normal law with deviation 1 of the logarithm: 91, 94, 95 and 96 (84, 88, 92 and 94).
 - Exponential law: 94, 96, 96 and 96 (90, 93, 94 and 95).

@@ -26,7 +26,7 @@ from diffabs.sweep.statistics.sensitivity import correlations, sobol_indices
 CONFIDENCE, QUANTILE_LEVELS, CVAR_LEVEL = 0.95, (0.05, 0.5, 0.95), 0.95
 MAX_CORRELATED_SAMPLES = 200_000  # correlations use at most this number of samples, the first ones
 MAX_LISTED_SAMPLES = 10
-# Skewness of the mean with a warning, |skewness|/sqrt(n). `experiments/mean_intervals.py`: where 95 % intervals of a
+# Skewness of the mean with a warning, |skewness|/sqrt(n). `experiments/mean_intervals`: where 95 % intervals of a
 # mean cover less than 94 %, it warns of 80 to 99 % of the samples; of 30 normal values each, of 1.2 % of the samples.
 MAX_SKEWNESS = 0.2
 MIN_SAMPLES = 4  # smallest number of samples with statistics

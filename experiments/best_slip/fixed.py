@@ -1,0 +1,104 @@
+"""What `run.py` judges by, fixed before anything was run: roads, errors of the sensors, what counts and how.
+
+The roads and cars are those of `pid_over_roads` (its `family`, its seeds, so its 2,048 held-out roads), each lane
+with its bound (`bound.py`). Either the slip and the deceleration are measured exactly, or the vehicle's speed
+is the integral of an accelerometer with noise and a bias, and the slip is computed with it: noise 0.1 m/s^2 at 1 kHz,
+bias within 0.05 m/s^2 and the floor of 4 m/s in the slip's denominator, all three out of `slip_estimator/noise.py`.
+
+A lane fails if it does not reach the stop in time, diverges, or locks (slip above 0.99, however shortly). Failures are
+counted and never averaged in. A rule's figure is the mean of distance/bound - 1 over the lanes that it stops; the gain
+on another rule is the mean over the lanes that both stop of (its distance - the rule's)/bound, with a t interval. The
+best rule is, of those that fail on at most 1 % of the lanes, the one with the least mean over the lanes that all of
+them stop. It is asked for exact sensors, and for sensors with errors, separately: tuned and judged under the same.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from diffabs import Batch
+from experiments._shared.roads import Family, Roads, family
+from experiments._shared.statistics import interval, kept
+from experiments.best_slip.bound import Bound, bound
+
+EXACT, ERRORS = "exact sensors", "noise and bias"
+
+
+@dataclasses.dataclass(frozen=True)
+class Fixed:
+    """What does not change when the search changes."""
+
+    roads: Roads = dataclasses.field(default_factory=Roads)  # its ranges, counts and seed; held out: the next seed
+    torque: float = 90.0  # N m, the most that the brake has
+    noise: float = 0.1  # m/s^2, standard deviation, at each sample
+    period: float = 1e-3  # s, of the samples
+    bias: float = 0.05  # m/s^2, either way, even
+    floor: float = 4.0  # m/s, in the denominator of the slip that is computed
+    stop: float = 2.0  # m/s, where a run ends; the rest is braked at the last deceleration
+    longest: float = 40.0  # s
+    step: float = 1e-3  # s, for judging
+    most_failures: float = 0.01  # of the lanes, of a rule that may be the best
+    confidence: float = 0.95
+
+
+@dataclasses.dataclass(frozen=True)
+class Lanes:
+    """Roads and cars with bias, noise and bound of each; values by path."""
+
+    family: Family
+    bias: np.ndarray
+    keys: np.ndarray
+    bound: Bound
+
+    def batch(self, sensors: str, **more: Any) -> Batch:
+        """The lanes as they are run; bias and noise where the sensors have errors."""
+        errors = sensors == ERRORS
+        values = self.family.values | ({"sensor.blocks.1.bias": self.bias} if errors else {})
+        return Batch(values, self.keys if errors else None, **more)
+
+
+def lanes(fixed: Fixed, count: int, seed: int) -> Lanes:
+    """So many lanes; those of another seed are other roads, biases and noises."""
+    roads = family(fixed.roads, count, seed)
+    bias = np.random.default_rng((seed, 7)).uniform(-fixed.bias, fixed.bias, count)
+    keys = np.arange(count) + (1 << 20) * seed
+    return Lanes(roads, bias, keys, bound(roads.values, fixed.torque, fixed.roads.width))
+
+
+def good(found: dict[str, Any]) -> np.ndarray:
+    """Lanes that stop, do not diverge and never lock (lanes,)."""
+    return found["stopped"] & ~found["diverged"] & ~(found["locked_time"] > 0)
+
+
+def line(fixed: Fixed, found: dict[str, Any], paper: dict[str, Any], shortest: np.ndarray) -> dict[str, Any]:
+    """What is said of a rule beside the paper's, in per cent of the bound (lanes,)."""
+    mine, both = good(found), good(found) & good(paper)
+    ratio = found["stop_distance"] / shortest
+    gain = (paper["stop_distance"] - found["stop_distance"])[both] / shortest[both]
+    above, above_half = interval(ratio[mine] - 1, fixed.confidence)
+    each = 100 * (kept(ratio, mine) - 1)
+    shorter, half = interval(gain, fixed.confidence)
+    return {
+        "above the bound [%]": 100 * above,
+        "+- [%]": 100 * above_half,
+        "median [%]": float(np.median(each)),
+        "95 % of them [%]": float(np.quantile(each, 0.95)),
+        "shorter than the paper's [%]": 100 * shorter,
+        "+- of that [%]": 100 * half,
+        "both stop": int(both.sum()),
+        "locked": int(np.sum(found["locked_time"] > 0)),
+        "not stopped": int(np.sum(~found["stopped"] & ~found["diverged"])),
+        "diverged": int(np.sum(found["diverged"])),
+    }
+
+
+def best(fixed: Fixed, results: dict[str, dict[str, Any]], shortest: np.ndarray) -> dict[str, Any]:
+    """The best of these rules by the criterion above: its name, and the mean of each over the common lanes [%]."""
+    count = len(shortest)
+    allowed = [name for name, one in results.items() if np.sum(~good(one)) <= fixed.most_failures * count]
+    if not allowed:
+        return {"best": None, "common lanes": 0, "above the bound [%]": {}}
+    common = np.all([good(results[name]) for name in allowed], axis=0)
+    means = {name: 100 * float(np.mean((results[name]["stop_distance"] / shortest)[common] - 1)) for name in allowed}
+    return {"best": min(means, key=lambda n: means[n]), "common lanes": int(common.sum()), "above the bound [%]": means}

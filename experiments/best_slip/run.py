@@ -1,0 +1,183 @@
+"""What does the best rule for the slip reach between the paper's estimator and what physics allows?
+
+Aoki and Nakamura take the slip at the greatest deceleration for their target. Over 2,048 roads that nobody has tuned
+for, one fixed slip, tuned, was shorter. Here each rule has its chance: the paper's latch, the latch for noisy sensors,
+extremum seeking, one fixed slip, a slip by the measured deceleration; each tuned by gradients on the same roads with
+the same search, with the PI and its anti-windup, for exact sensors. What was found is judged with exact sensors, and
+with an accelerometer that has noise and a bias; with `rules` it can be tuned for that, too.
+Distances are relative to the shortest that each road allows a brake of 90 N m (`bound.py`). What is judged
+and how was fixed before the first run (`fixed.py`).
+
+    python experiments/best_slip/run.py
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffabs import Batch, FixedStep, Loop, plot, run_batch
+from diffabs.papers import record
+from experiments._shared.entry import with_times
+from experiments._shared.statistics import interval
+from experiments.best_slip.fixed import ERRORS, EXACT, Fixed, Lanes, best, good, lanes, line
+from experiments.best_slip.rules import FIXED, KNOWN, PAPER, ROBUST, RULES, Ranges, start, told_the_peak, untuned
+from experiments.best_slip.search import MEASURED, Search, against_differences, by_cma_es, described, tuned
+
+Metrics = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Every number of the experiment."""
+
+    fixed: Fixed = dataclasses.field(default_factory=Fixed)
+    ranges: Ranges = dataclasses.field(default_factory=Ranges)
+    search: Search = dataclasses.field(default_factory=Search)
+    rules: Mapping[str, tuple[str, ...]] = dataclasses.field(  # that are tuned, by sensors: exact ones first, and then
+        default_factory=lambda: {EXACT: RULES, ERRORS: ()}  # a fixed slip is among them. Others are carried over
+    )
+    searched_again: tuple[str, ...] = (ROBUST,)  # by CMA-ES, with exact sensors
+    farthest: float = 25.0  # % above the bound, end of the figure
+    out: str = "out/experiments/best_slip"
+
+
+def judged(config: Config, one: Loop, batch: Batch, finer: int = 1) -> Metrics:
+    """Metrics of every lane, with so many times shorter steps."""
+    solver = FixedStep(step=config.fixed.step / finer, duration=config.fixed.longest)
+    done = jax.device_get(run_batch(one, batch, solver, MEASURED, engine="kernel"))
+    return {**done.metrics, "stopped": done.stopped, "diverged": done.diverged}
+
+
+def contenders(config: Config, sensors: str, unseen: Lanes, own: dict[str, Loop]) -> dict[str, tuple[Loop, Batch]]:
+    """Loops and lanes: untuned, tuned, and what knows each road, with the controller of the fixed slip."""
+    batch = unseen.batch(sensors)
+    seen = start(config.ranges, config.fixed, sensors, FIXED).sensor
+    those = {name: (one, batch) for name, one in untuned(config.ranges, config.fixed, sensors)}
+    those |= {name: (dataclasses.replace(one, sensor=seen), batch) for name, one in own.items()}
+    return those | {KNOWN: told_the_peak(config.fixed, sensors, own[FIXED].controller, unseen)}
+
+
+def by_road(name: str, found: Metrics, unseen: Lanes) -> dict[str, Any]:
+    """Means above the bound [%] on kinds of roads: where the bound is attained, and where nobody attains it."""
+    bound, mine = unseen.bound, good(found)
+    excess = 100 * (found["stop_distance"] / bound.distance - 1)
+    level = unseen.family.values["plant.road.roads.0.D"]
+    kinds = {
+        "one surface": bound.attained,
+        "one surface, peak below 0.3": bound.attained & (level < 0.3),
+        "one surface, peak above 0.8": bound.attained & (level > 0.8),
+        "with an edge, to less friction": ~bound.attained & _falls(unseen),
+        "with an edge, to more": ~bound.attained & ~_falls(unseen),
+    }
+    means = {
+        kind: float(np.mean(excess[lanes & mine])) if np.any(lanes & mine) else None for kind, lanes in kinds.items()
+    }
+    return {"rule": name, **means}
+
+
+def _falls(unseen: Lanes) -> np.ndarray:
+    values = unseen.family.values
+    return values["plant.road.roads.1.D"] < values["plant.road.roads.0.D"]
+
+
+def halved(config: Config, one: Loop, batch: Batch, found: Metrics, shortest: np.ndarray) -> dict[str, Any]:
+    """By how much the mean above the bound changes [%] if steps are half as long; lanes that end otherwise."""
+    again = judged(config, one, batch, finer=2)
+    both = good(found) & good(again)
+    change = (again["stop_distance"] - found["stop_distance"])[both] / shortest[both]
+    return {
+        "mean change [%]": 100 * float(np.mean(change)) if both.any() else None,
+        "lanes that end otherwise": int(np.sum(good(found) != good(again))),
+    }
+
+
+def of_sensors(
+    config: Config, sensors: str, told: Callable[[str], None], carried: dict[str, Loop]
+) -> tuple[dict[str, Any], dict[str, Metrics], dict[str, Loop]]:
+    """Tune the rules that are to be tuned for these sensors, judge them and those that are carried over, check them:
+    what is said of them, the metrics of every lane, and the loops by rule."""
+    fixed, found = config.fixed, {}
+    for rule in config.rules[sensors]:
+        found[rule] = tuned(config.search, fixed, sensors, rule, config.ranges)
+        told(f"{sensors}, {rule}: {found[rule].tuned.objective[1]:.5f}")
+    own = carried | {rule: one.loop for rule, one in found.items()}
+    unseen = lanes(fixed, fixed.roads.held_out, fixed.roads.seed + 1)
+    shortest = unseen.bound.distance
+    those = contenders(config, sensors, unseen, own)
+    results = {name: judged(config, *one) for name, one in those.items()}
+    told(f"{sensors}: judged")
+    named = {n: (f"tuned, {n}" if n in found else f"tuned for {EXACT}, {n}") if n in own else n for n in results}
+    checks = {named[name]: halved(config, *those[name], results[name], shortest) for name in (PAPER, *own)}
+    told(f"{sensors}: halved")
+    slopes = {
+        rule: against_differences(config.search, fixed, sensors, rule, config.ranges, one.loop)
+        for rule, one in found.items()
+    }
+    told(f"{sensors}: differences")
+    said = {
+        "table": [{"rule": named[n], **line(fixed, one, results[PAPER], shortest)} for n, one in results.items()],
+        "by road": [by_road(named[name], one, unseen) for name, one in results.items()],
+        "best": best(fixed, {rule: results[rule] for rule in own}, shortest),
+        "tuning": {rule: described(one) for rule, one in found.items()},
+        "half the step": checks,
+        "derivatives": slopes,
+    }
+    return said, results, own
+
+
+def of_bounds(fixed: Fixed) -> dict[str, Any]:
+    """What the bound adds to the distance at the peak's friction alone, and of how many roads what is true."""
+    bound = lanes(fixed, fixed.roads.held_out, fixed.roads.seed + 1).bound
+    mean, half = interval(bound.distance / bound.friction - 1, fixed.confidence)
+    return {
+        "above friction alone [%]": 100 * mean,
+        "+- [%]": 100 * half,
+        "attained": int(bound.attained.sum()),
+        "torque too weak for the first peak": int(bound.weak.sum()),
+    }
+
+
+def figure(config: Config, results: dict[str, dict[str, Metrics]], shortest: np.ndarray) -> Any:
+    """Share of all roads that a rule stops within so many per cent of the bound; failures never count."""
+    sheet, axes = plot.sheet(1, len(results), title="Stops on roads not tuned for", size=(5.6, 4.4), sharey=True)
+    for ax, (sensors, those) in zip(axes, results.items(), strict=True):
+        for j, name in enumerate((PAPER, *RULES, KNOWN)):
+            if name not in those:
+                continue
+            one = those[name]
+            above = np.sort(100 * (one["stop_distance"] / shortest - 1)[good(one)])
+            share = 100 * np.arange(1, len(above) + 1) / len(shortest)
+            if not np.any(above <= config.farthest):  # a legend entry without a curve says why there is none
+                name = f"{name}: none within {config.farthest:g} %"
+            ax.plot(above, share, plot.DASHES[j], color=plot.COLOURS[j], label=name)
+        ax.set_xlim(0.0, config.farthest)
+        ax.set_ylim(0.0, 100.0)
+        plot.label_axes(ax, "above the bound [%]", "share of the roads [%]" if ax is axes[0] else "", sensors)
+    return sheet
+
+
+def main(config: Config | None = None, progress: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
+    """Run, print, save; returns the results."""
+    config, begun = config or Config(), time.process_time()
+    said, results, own = {}, {}, {}
+    for sensors in config.rules:
+        said[sensors], results[sensors], own = of_sensors(config, sensors, progress, own)
+        count = config.fixed.roads.held_out
+        record.print_rows(
+            f"{sensors}: {count} roads, intervals of {config.fixed.confidence:.0%}", said[sensors]["table"]
+        )
+        record.print_rows(f"{sensors}: means above the bound [%] by kind of road", said[sensors]["by road"])
+    again = {rule: by_cma_es(config.search, config.fixed, EXACT, rule, config.ranges) for rule in config.searched_again}
+    shortest = lanes(config.fixed, config.fixed.roads.held_out, config.fixed.roads.seed + 1).bound.distance
+    whole = {**said, "bound": of_bounds(config.fixed), "CMA-ES, exact sensors": again}
+    whole["seconds of processor time"] = time.process_time() - begun
+    return record.experiment(config, whole, {"roads": figure(config, results, shortest)})
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    main(progress=with_times())

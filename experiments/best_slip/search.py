@@ -1,0 +1,155 @@
+"""How `run.py` tunes a rule: gradients from several starts on a few roads, from the best of them on all; and how
+that is checked: CMA-ES from the same start, and differences in place of derivatives."""
+
+import dataclasses
+import time
+from typing import Any
+
+import cma
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs import FixedStep, Loop, run_batch
+from diffabs.core.bijectors import parameter_space
+from diffabs.objectives import LockedTime, StopDistance
+from diffabs.tune import Method, Stopping, Tuned, build_problem, tune
+from diffabs.tune.problem import Problem
+from experiments.best_slip.fixed import EXACT, Fixed, Lanes, lanes
+from experiments.best_slip.rules import Ranges, start
+
+MEASURED = {"stop_distance": StopDistance(), "locked_time": LockedTime()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    """Every number of the search, the same for all rules."""
+
+    roads: int = 256  # on which the best start is tuned
+    few: int = 64  # of them, on which all starts are tried
+    starts: int = 6
+    tried: int = 12  # steps of each
+    iterations: int = 20  # steps of the best
+    seed: int = 19
+    exact_step: float = 2e-3  # s
+    noisy_step: float = 1e-3  # s: the period of the noise
+    cma_evaluations: int = 320
+    spread: float = 0.5  # of CMA-ES at its start, in the coordinates of `tune`
+    widths: tuple[float, ...] = (1e-2, 1e-3, 1e-4)  # of differences, in the same coordinates
+    agreement: float = 0.01  # of a lane's derivative
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """A rule that is tuned; how, and with how many runs' derivatives (starts that had ended are counted, too)."""
+
+    tuned: Tuned
+    tried: Tuned
+    seconds: float  # of processor time
+
+    @property
+    def loop(self) -> Loop:
+        """The loop that was found."""
+        return self.tuned.loop
+
+
+def mean_logarithm(values: Any) -> Any:
+    """Return what is made small of distances in units of their bounds (n,): for all but lanes that hardly stop the mean
+    excess; one of those counts as some five hundred per cent, not as a hundred thousand."""
+    return jnp.mean(jnp.log(values))
+
+
+def task(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, known: Lanes) -> dict[str, Any]:
+    """The arguments of `build_problem`, but for the loop."""
+    step = search.exact_step if sensors == EXACT else search.noisy_step
+    return {
+        "free": ranges.of(rule),
+        "objective": {"stop_distance": 1.0},
+        "over": known.batch(sensors, weights=1 / known.bound.distance),
+        "solver": FixedStep(step=step, duration=fixed.longest),
+        "measured": MEASURED,
+        "aggregate": mean_logarithm,
+        "engine": "kernel",
+    }
+
+
+def tuned(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges) -> Found:
+    """Return the best of several starts, tuned on all roads of the tuning."""
+    begun = time.process_time()
+    seed = fixed.roads.seed
+
+    def descend(one: Any, count: int, starts: int, iterations: int) -> Tuned:
+        how = Method(starts=starts, seed=search.seed, stopping=Stopping(change=1e-6, iterations=iterations))
+        known = lanes(fixed, count, seed)
+        return tune(build_problem(one, **task(search, fixed, sensors, rule, ranges, known)), method=how)
+
+    tried = descend(start(ranges, fixed, sensors, rule), search.few, search.starts, search.tried)
+    found = descend(tried.part, search.roads, 1, search.iterations)
+    return Found(found, tried, time.process_time() - begun)
+
+
+def described(found: Found) -> dict[str, Any]:
+    """Of what a search found, and how."""
+    one = found.tuned
+    return {
+        "objective": {"before": float(one.objective[0]), "after": float(one.objective[1])},
+        "values": {path: np.asarray(x).tolist() for path, x in one.values.items()},
+        "reason": one.reason.value,
+        "gradients": one.evaluations,
+        "starts": [{"objective": s.objective, "reason": s.reason.value} for s in found.tried.starts],
+        "gradients of the starts": sum(s.history[-1].evaluations for s in found.tried.starts),
+        "seconds": found.seconds,
+    }
+
+
+def problem(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, one: Loop) -> Problem:
+    """The tuning's problem on all of its roads, around a loop."""
+    known = lanes(fixed, search.roads, fixed.roads.seed)
+    return build_problem(one, **task(search, fixed, sensors, rule, ranges, known))
+
+
+def by_cma_es(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges) -> dict[str, Any]:
+    """CMA-ES on all roads, from where the gradients started: the least objective, and where."""
+    begun = time.process_time()
+    one = start(ranges, fixed, sensors, rule)
+    posed_ = problem(search, fixed, sensors, rule, ranges, one)
+    seen = posed_.objective_evaluator()
+    options = {"maxfevals": search.cma_evaluations, "verbose": -9, "verb_log": 0, "seed": search.seed}
+    strategy = cma.CMAEvolutionStrategy(posed_.space.place(one), search.spread, options)
+    while not strategy.stop():
+        asked = strategy.ask()
+        values = np.asarray(seen(jnp.asarray(np.array(asked))).objective)
+        strategy.tell(asked, np.nan_to_num(values, nan=1e3, posinf=1e3).tolist())
+    best = strategy.result
+    values = {path: np.asarray(x).tolist() for path, x in posed_.space.values(best.xbest).items()}
+    seconds = time.process_time() - begun
+    return {"objective": best.fbest, "values": values, "evaluations": best.evaluations, "seconds": seconds}
+
+
+def against_differences(
+    search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, one: Loop
+) -> dict[str, Any]:
+    """How many lanes have, where a search ended, the derivative that central differences of several widths show: of
+    distance/bound, along one random direction in the coordinates of `tune`, in which every component has its share.
+
+    Lane by lane, since a mean of differences says nothing once a lane jumps: a latch that takes another maximum. A lane
+    agrees with a width to `agreement` of the derivative, or to 1e-5."""
+    known = lanes(fixed, search.roads, fixed.roads.seed)
+    given = task(search, fixed, sensors, rule, ranges, known)
+    coordinates, solver = parameter_space(one, given["free"]), dataclasses.replace(given["solver"], kinks=True)
+    z = np.asarray(coordinates.place(one))
+    way = np.random.default_rng(search.seed).normal(size=len(z))
+    way /= np.linalg.norm(way)
+
+    def ratios(z: Any) -> Any:
+        run = run_batch(coordinates.at(one, z), given["over"], solver, MEASURED, engine="kernel")
+        return run.metrics["stop_distance"] / known.bound.distance
+
+    along = jax.jit(lambda z: jax.jvp(ratios, (z,), (jnp.asarray(way),)))
+    slope = np.asarray(along(z)[1])
+    fine, each = np.zeros(len(slope), bool), {}
+    for width in search.widths:
+        high, low = (np.asarray(along(z + sign * width * way)[0]) for sign in (1, -1))
+        agrees = np.abs((high - low) / (2 * width) - slope) <= search.agreement * np.abs(slope) + 1e-5
+        each[f"{width:g}"], fine = int(np.sum(agrees)), fine | agrees
+    return {"lanes": len(slope), "agree by width": each, "agree with one": int(np.sum(fine))}

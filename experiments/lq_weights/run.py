@@ -1,0 +1,190 @@
+"""Is it worth while to differentiate? Gains, and LQ weights through the Riccati equation and through the LMI.
+
+What derivatives are worth is what the same search takes on derivatives and on forward differences: SciPy's L-BFGS-B.
+Beside it stand `diffabs.tune`, Nelder-Mead, and CMA-ES at the best of several first steps, chosen afterwards for each
+accuracy. `searches.py` says how they are counted, `problems.py` which problems of 2 to 48 parameters there are.
+
+What counts is rollouts of the batch until the objective is within a hundredth, a ten thousandth and a millionth of the
+way from the start to the best that any search found. A gradient counts at its price over a rollout that measures
+nothing but the objective.
+
+    python experiments/lq_weights/run.py searches [PROBLEM ...]    (needs the package cma, of the dependency group test)
+
+Each problem is kept in a file of its own; table and figure show all that are there.
+"""
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from diffabs import plot
+from diffabs.controllers import StateFeedback
+from diffabs.design import Spec, certify, design
+from diffabs.papers import record
+from diffabs.tune import Method, Stopping, Tuned, tune
+from diffabs.tune.problem import Problem
+from diffabs.tune.weights import LQWeights
+from experiments._shared.entry import run_part
+from experiments.lq_weights import searches, second_order
+from experiments.lq_weights.problems import NAMES, Config, box, problems
+
+TUNE, GRADIENTS, DIFFERENCES = "tune", "L-BFGS-B", "L-BFGS-B, differences"
+NELDER_MEAD, CMA_ES = "Nelder-Mead", "CMA-ES"
+WITH = (TUNE, GRADIENTS)  # derivatives
+
+
+def bare(problem: Problem) -> Problem:
+    """Measuring nothing but the objective."""
+    return dataclasses.replace(problem, measured={name: problem.measured[name] for name in problem.weights})
+
+
+def allowed(config: Config, parameters: int) -> int:
+    """Evaluations of a derivative-free search."""
+    return next(budget for most, budget in config.budgets if parameters <= most)
+
+
+def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
+    """One problem, all searches. Traces of `TUNE` and `GRADIENTS` count gradients, the others rollouts."""
+    pose = problems(config)[name]
+    problem = bare(pose())
+    large = int(problem.space.size > 2)
+    prices = searches.prices(problem, config.repeats)
+    mode = min(prices, key=lambda mode: prices[mode])
+    most = config.iterations[large]
+    stopping = Stopping(gradient=1e-9, change=1e-11, iterations=most)
+    found = tune(pose(mode=mode), method=Method(memory=searches.MEMORY, stopping=stopping))
+    print(f"{name}: tune {found.objective[1]:.9g}, {found.evaluations} gradients; {found.reason.value}", flush=True)
+    budget = allowed(config, problem.space.size)
+    asked: dict[str, Callable[[], searches.Trace]] = {
+        GRADIENTS: lambda: searches.gradients(problem, mode, most),
+        DIFFERENCES: lambda: searches.differences(problem, budget),
+        NELDER_MEAD: lambda: searches.nelder_mead(problem, budget),
+        **{
+            f"{CMA_ES}, first step {first:g}": partial(searches.cma_es, problem, budget, config.seed, first)
+            for first in config.first_steps
+        },
+    }
+    traces = {TUNE: [(float(p.evaluations), p.objective) for p in found.history]}
+    for who, search in asked.items():
+        traces[who] = search()
+        print(f"{name}: {who} {traces[who][-1]}", flush=True)
+    return {
+        "problem": name,
+        "parameters": problem.space.size,
+        "lanes": problem.batch.size,
+        "prices": {m.value: p for m, p in prices.items()},
+        "price": prices[mode],
+        "start": found.objective[0],
+        "found": {who: trace[-1][1] for who, trace in traces.items()},
+        "spent": {who: trace[-1][0] for who, trace in traces.items()},
+        "traces": traces,
+        "values": {path: np.asarray(value).tolist() for path, value in found.values.items()},
+    }, found
+
+
+def lines(config: Config, kept: dict[str, Any]) -> list[dict[str, Any]]:
+    """The rows of one problem, one for each accuracy."""
+    start, best = kept["start"], min(kept["found"].values())
+    return [line(kept, f"{near:g}", best + near * (start - best)) for near in config.near]
+
+
+def line(kept: dict[str, Any], accuracy: str, target: float) -> dict[str, Any]:
+    """Rollouts to a target; None where it was not reached. A ratio is None where derivatives did not reach it, and a
+    lower bound where the search without them did not, and counts as what it spent."""
+    counts = {who: searches.needed(trace, target) for who, trace in kept["traces"].items()}
+    rollouts = {who: n * kept["price"] if who in WITH else n for who, n in counts.items()}
+    tuned = [who for who in counts if who.startswith(CMA_ES)]
+    best = min(tuned, key=lambda who: (rollouts[who], kept["found"][who]))
+
+    def fewer(other: str) -> float | None:
+        theirs = rollouts[other] if np.isfinite(rollouts[other]) else kept["spent"][other]
+        return theirs / rollouts[GRADIENTS] if np.isfinite(rollouts[GRADIENTS]) else None
+
+    shown = {who: rollouts[who] for who in (TUNE, GRADIENTS, DIFFERENCES, NELDER_MEAD)} | {CMA_ES: rollouts[best]}
+    return {
+        "problem": kept["problem"],
+        "parameters": kept["parameters"],
+        "accuracy": accuracy,
+        "price": kept["price"],
+        "gradients": int(counts[GRADIENTS]) if np.isfinite(counts[GRADIENTS]) else None,
+        **{who: round(n) if np.isfinite(n) else None for who, n in shown.items()},
+        "best of CMA-ES": best.removeprefix(f"{CMA_ES}, "),
+        "differences / gradients": fewer(DIFFERENCES),
+        "CMA-ES / gradients": fewer(best),
+    }
+
+
+def gains(config: Config, found: dict[str, Tuned]) -> list[dict[str, Any]]:
+    """The gain that each problem on the rig ended with, what it does, and what is proved of it without the lag."""
+    rows = []
+    for name, one in found.items():
+        if not isinstance(one.loop.controller, StateFeedback):
+            continue
+        gain = np.asarray(one.loop.controller.gain)
+        proof = certify(gain, box(config), fastest=True)
+        metrics = one.metrics[1]
+        rows.append(
+            {
+                "tuned": name,
+                "k1": float(gain[0]),
+                "k2": float(gain[1]),
+                "Q": np.round(np.asarray(one.part.weights()[0]), 1).tolist() if isinstance(one.part, LQWeights) else "",
+                "objective": one.objective[1],
+                "worst overshoot [%]": 100 * float(metrics["overshoot"].max()),
+                "mean IAE [s]": float(metrics["iae"].mean()),
+                "common P": {True: "yes", False: "none", None: "undecided"}[proof.quadratically_stable],
+                "decay proved [1/s]": proof.decay_rate,
+            }
+        )
+    return rows
+
+
+def paper(config: Config) -> np.ndarray:
+    """The robust design with the paper's weights, for orientation."""
+    return design(box(config), Spec(Q=config.weights, R=1.0)).gain[0]
+
+
+def figures(kept: list[dict[str, Any]]) -> dict[str, Any]:
+    """Distance to the best over rollouts, one panel per problem."""
+    figure, axes = plot.sheet(-(-len(kept) // 3), min(3, len(kept)), title="What a gradient is worth", size=(5.0, 3.3))
+    for ax, row in zip(axes, kept, strict=False):
+        best = min(row["found"].values())
+        for i, (name, trace) in enumerate(row["traces"].items()):
+            n, value = np.array(trace).T
+            n = n * row["price"] if name in WITH else n
+            gap = np.maximum((value - best) / (row["start"] - best), 1e-9)
+            style = {"ls": plot.DASHES[i % len(plot.DASHES)], "color": plot.COLOURS[i % len(plot.COLOURS)]}
+            ax.loglog(n, gap, label=name, drawstyle="steps-post", **style)
+        title = f"{row['problem']}: {row['parameters']} parameters"
+        plot.label_axes(ax, "rollouts of the batch", "distance to the best", title)
+    for ax in axes[len(kept) :]:
+        ax.set_visible(False)
+    return {"searches": figure}
+
+
+def main(config: Config | None = None, names: tuple[str, ...] = NAMES) -> dict[str, Any]:
+    """Run, print, save; returns the results."""
+    config = config or Config()
+    folder = pathlib.Path(config.out)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        kept, found = compared(config, name)
+        record.write_summary(folder, kept | {"gains": gains(config, {name: found})}, f"{name.replace(' ', '_')}.json")
+    files = [folder / f"{name.replace(' ', '_')}.json" for name in NAMES]
+    kept = [json.loads(path.read_text(encoding="utf-8")) for path in files if path.exists()]
+    rows = [row for one in kept for row in lines(config, one)]
+    record.print_rows("Rollouts of the batch", rows)
+    end = [row for one in kept for row in one["gains"]]
+    if end:
+        record.print_rows("Gains on the rig", end)
+    results = {"table": rows, "gains": end, "paper_weights_gain": paper(config).tolist()}
+    return record.experiment(config, results, figures(kept))
+
+
+if __name__ == "__main__":
+    run_part({"searches": lambda names: main(names=tuple(names) or NAMES), "second-order": second_order.main})
