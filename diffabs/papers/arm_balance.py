@@ -41,7 +41,7 @@ FINE = FixedStep(step=1e-5, duration=0.1, every=10)  # for the start at which th
 PAPER_START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])  # start of Fig. 3 [rad, rad/s]
 HANGING = ArmBalance(arm_length=-0.5)
 WEIGHTS, EFFORT = (1.0, 100.0, 1.0, 1.0, 1.0, 1.0), 0.01  # Q and R of the LQR for the hanging arm
-# From experiments/two_wheeler/weights.py: weights tuned by gradients for the largest region of attraction at 48 V.
+# From experiments/two_wheeler: weights tuned by gradients for the largest region of attraction at 48 V.
 TUNED = (50466.024, -3214.2056, 20068.574, 17861.686, -92.413308, 7435.5672)
 VOLTAGES = (24.0, 48.0, 100.0)
 RIDERS = np.linspace(40.0, 100.0, 13)  # kg

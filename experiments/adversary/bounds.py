@@ -7,7 +7,7 @@ measured slip, one for each millisecond, which repeat, and mass and speed of the
     noise   mean 0, root mean square at most 1, |z_k| <= peak:   errors deviation z
     start   |z| <= 1:   mass and speed from one end of the box of `real_rig` to the other
 
-`feasible` brings any numbers into the set, and is what every search uses. docs/adversary.md has the same in a table.
+`feasible` brings any numbers into the set, and is what every search uses. README.md has the same in a table.
 """
 
 import dataclasses

@@ -6,7 +6,7 @@ parameters differ from zero by two standard deviations. Then all of experiment 1
 Experiment 2 judges: nothing is fitted to it. A fit from ten starts shows the minima, without and with the compliance of
 tyre and belt.
 
-Last, controllers run on the rig as its mask describes it and as it was identified (docs/measured-rig.md).
+Last, controllers run on the rig as its mask describes it and as it was identified (README.md).
 
     python experiments/measured_rig/run.py [PART ...] [--data FOLDER]
 """
@@ -317,7 +317,7 @@ def diagnosis(first: Record, second: Record, rig: LabRig, found: Identified) -> 
 
 
 def torque_controllers() -> dict[str, dict[str, Any]]:
-    """The parts of three controllers of docs/results.md and docs/real-rig.md, for a plant whose input is a torque."""
+    """The parts of three controllers of `overshoot_cured` and `real_rig`, for a plant whose input is a torque."""
     tuned = json.loads((pathlib.Path("docs") / "controllers" / "known-tuned-cvar.json").read_text())["parameters"]
     value = {path: entry["value"] for path, entry in tuned.items()}
     holding = ConstantInput(value=value["feedforward.value"])

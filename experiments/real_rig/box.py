@@ -2,7 +2,7 @@
 
 What a controller does not know, each within its range, independent and uniform; what is the same everywhere stands in
 `Fixed`. The vehicle's speed is either known, with an error that drifts, or estimated from the wheel's speed and an
-accelerometer. docs/real-rig.md has the same numbers in a table."""
+accelerometer. README.md has the same numbers in a table."""
 
 import dataclasses
 import itertools

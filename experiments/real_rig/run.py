@@ -1,6 +1,6 @@
 """Is the overshoot cured on the rig as it really is, everything wrong at once?
 
-The box of what a controller does not know was fixed beforehand (`box.py`, docs/real-rig.md). Estimator of the
+The box of what a controller does not know was fixed beforehand (`box.py`, README.md). Estimator of the
 speed, reference and controller are tuned together, by gradients over thousands of lanes (`tune.py`), beside
 what others find (`others.py`), what no gain can do (`floor.py`) and what can be proved
 (`proof.py`), and judged at weak spots, in all corners and on 100,000 points (`judge.py`).

@@ -19,13 +19,13 @@ DOCS = ROOT / "docs"
 
 
 def loaded(name):
-    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name, DOCS / "_build" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-exported, parameters = loaded("exported"), loaded("parameters")
+exported, parameters, studies = loaded("exported"), loaded("parameters"), loaded("studies")
 
 INNER = {
     "cli",
@@ -81,7 +81,7 @@ def parts():
     }
 
 
-@killed_by("../docs/parameters.py", 'left = "(" if "above" in bound or low', 'left = "(" if low')
+@killed_by("../docs/_build/parameters.py", 'left = "(" if "above" in bound or low', 'left = "(" if low')
 def test_the_reference_shows_unit_and_range_of_every_parameter():
     """Its tables are read from the text of the classes, and the classes say the same."""
     assert len(parts()) > 60
@@ -93,7 +93,7 @@ def test_the_reference_shows_unit_and_range_of_every_parameter():
         assert all(unit for unit, _ in said.values()), path
 
 
-@killed_by("../docs/parameters.py", 'named = {"unit": "Unit of the value", ', "named = {")
+@killed_by("../docs/_build/parameters.py", 'named = {"unit": "Unit of the value", ', "named = {")
 def test_a_part_becomes_a_table():
     text = parameters.table(inspect.getsource(importlib.import_module("diffabs.controllers").PID))
     assert "| `b` | `1.0` | 1 | [0, inf) | Set-point weight of the proportional part. |" in text.splitlines()
@@ -148,9 +148,31 @@ def test_a_formula_that_is_left_as_latex_ends_the_build():
 
 
 def test_every_page_is_in_the_navigation():
-    said = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    listed = set(re.findall(r"^ +- ([\w/-]+\.md)$", said, re.MULTILINE))
-    assert listed == {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")}
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^ +- ([\w/-]+\.md)$", text, re.MULTILINE))
+    of_studies = {uri for uri in studies.study_files() if uri.endswith(".md")}
+    assert listed == {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")} | of_studies
+
+
+@killed_by("../docs/_build/studies.py", '.removeprefix("docs/")', "")
+def test_a_link_between_docs_and_a_study_is_that_of_the_site():
+    """The site has `docs` at its top, the repository beside `experiments`."""
+    links = {
+        "index.md": {"../experiments/a/README.md#b": "experiments/a/README.md#b", "faq.md": "faq.md"},
+        "design-notes/a.md": {"../../experiments/a/b.png": "../experiments/a/b.png", "../faq.md#a": "../faq.md#a"},
+        "experiments/a/README.md": {"../../docs/faq.md": "../../faq.md", "../b/README.md": "../b/README.md"},
+    }
+    for uri, pairs in links.items():
+        for link, site in pairs.items():
+            assert studies.site_links(f"see [it]({link}).", uri) == f"see [it]({site})."
+    assert studies.site_links("[a](https://b.org/c.md)", "index.md") == "[a](https://b.org/c.md)"
+
+
+def test_every_study_has_an_entry_and_a_page():
+    """`literature` is a command: `diffabs reproduce literature`."""
+    folders = {path.parent for path in (ROOT / "experiments").glob("[a-z]*/*") if path.suffix in (".py", ".md")}
+    assert {folder.name for folder in folders if not (folder / "README.md").exists()} == set()
+    assert {folder.name for folder in folders if not (folder / "run.py").exists()} == {"literature"}
 
 
 @pytest.fixture(scope="module")
@@ -244,7 +266,7 @@ def test_the_search_answers(site):
     assert "reference/objectives" in pages["time"]
 
 
-@killed_by("../docs/site_search.py", "count != 1", "False")
+@killed_by("../docs/_build/site_search.py", "count != 1", "False")
 def test_a_search_script_without_the_fault_is_noticed():
     repaired = loaded("site_search").repaired
     assert repaired("e=e+s+o.id}") == 'e=e+s+o.id+","}'

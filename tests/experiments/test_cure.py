@@ -1,4 +1,4 @@
-"""The cured controller where it is weak: against a second version in NumPy, and what docs/results.md says of it."""
+"""The cured controller where it is weak: against a second version in NumPy, and what its page says of it."""
 
 import importlib
 import re
@@ -11,7 +11,7 @@ from diffabs import FixedStep
 from diffabs.scenario.scenario import load
 
 STEP = 2.5e-4  # s
-RESULTS = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "experiments" / "overshoot_cured" / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -100,14 +100,14 @@ def test_a_target_that_starts_from_zero_overshoots_more():
 
 
 def cells(start):
-    (line,) = re.findall(rf"^\| \*\*{start}.*$", RESULTS, re.MULTILINE)
+    (line,) = re.findall(rf"^\| \*\*{start}.*$", PAGE, re.MULTILINE)
     return [cell.strip(" *") for cell in line.strip("|").split("|")]
 
 
 @pytest.mark.slow
 def test_the_readme_says_how_weak_the_cure_is(module, corner):
     """The corner is the worst of the box in all of them but noise, which differs from seed to seed."""
-    table = next(line for line in RESULTS.splitlines() if line.startswith("| controller | from 51"))
+    table = next(line for line in PAGE.splitlines() if line.startswith("| controller | from 51"))
     heads = [cell.strip() for cell in table.strip("|").split("|")]
     assert heads[2:6] == ["friction +10 %", "lag 2 ms", "inertia +10 %", "computing 1 ms"]
     assert heads[6] == module.NOISY
@@ -127,7 +127,7 @@ def test_more_is_asked_for_than_is_allowed(module, cure):
     """Windup: there is no anti-windup, and with the limits in the actuator nothing else changes."""
     box, solver = module.Box(masses=(6.2,), speeds=(50.0,)), FixedStep(step=STEP, duration=0.2)
     low, high = module.torques(cure, box, solver)
-    assert f"asks for {high:.1f} N m where 9.03 are allowed" in " ".join(RESULTS.split())
+    assert f"asks for {high:.1f} N m where 9.03 are allowed" in " ".join(PAGE.split())
     assert high > 2 * 9.03
     assert low >= 0
 

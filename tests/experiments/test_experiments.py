@@ -278,7 +278,7 @@ def test_the_bound_rises_as_the_root_of_the_motor_power(monkeypatch):
 
 @pytest.mark.parametrize(
     ("only", "known", "estimated"),
-    [  # whether it is met, near the floor [%], worst corner [%], proof; as docs/real-rig.md says of more points
+    [  # whether it is met, near the floor [%], worst corner [%], proof; as the study's page says of more points
         ("published", ("no", 0, 143, "unstable"), ("no", 0, 150, "unstable")),
         ("tuned-cvar", ("yes", 99.9, 20, "proved"), ("no", 55, 96, "proved")),
     ],
@@ -316,7 +316,9 @@ def test_the_power_of_a_motor_knows_the_limit_of_its_current(monkeypatch, resist
 
 def rows_of_page(page, first, last):
     """Cells of a table between two lines of a page."""
-    text = (ROOT / "docs" / page).read_text(encoding="utf-8").partition(first)[2].partition(last)[0]
+    text = (
+        (ROOT / "experiments" / page / "README.md").read_text(encoding="utf-8").partition(first)[2].partition(last)[0]
+    )
     lines = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
     return {cells[0].strip("*"): cells[1:] for cells in lines}
 
@@ -324,8 +326,8 @@ def rows_of_page(page, first, last):
 def test_each_row_of_machines_has_the_bound_of_its_own_machine(monkeypatch):
     """By the left eigenvector w of the unstable pole s: |w'B| U/(s |w'd|). The page has three digits of a machine."""
     plant, start = load("arm-hanging").loop.plant, np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])
-    machines = rows_of_page("two-wheeler.md", "The tuned machines:", "**The paper's motor")
-    bounds = rows_of_page("two-wheeler.md", "## A machine for the claim", "The machines of greatest bound")
+    machines = rows_of_page("two_wheeler", "The tuned machines:", "**The paper's motor")
+    bounds = rows_of_page("two_wheeler", "## A machine for the claim", "The machines of greatest bound")
     names = {"best flywheel, 3 ohm": "flywheel, 3 ohm", "best rod, 0.3 ohm, 60 A, 1.80 kW": "rod, 0.3 ohm",
              "best flywheel, 0.3 ohm, 60 A, 1.80 kW": "flywheel, 0.3 ohm",
              "the same improved for 50 kg alone": "the same for 50 kg",

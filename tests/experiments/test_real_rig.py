@@ -138,7 +138,7 @@ def test_each_kind_of_controller_is_committed():
 
 def slip_poles(k, at):
     """Greatest |pole| of the sampled slip loop of a machine, by SciPy's matrix exponential from the equations of
-    docs/real-rig.md: integral (Euler), slip error, torque of the brake, torque of the last sample."""
+    the study's page: integral (Euler), slip error, torque of the brake, torque of the last sample."""
     h, slip, g, r1 = 1e-3, 0.2, 9.81, 0.0995
     mass, inertia, w4, v, lag, delay = at
     road = RIG.__class__(w1=RIG.w1, w2=RIG.w2, w3=RIG.w3, w4=w4, a=RIG.a, q=RIG.q)

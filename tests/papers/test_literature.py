@@ -22,7 +22,7 @@ from diffabs.scenario.registry import family_types
 from diffabs.scenario.scenario import load, names
 from diffabs.stops import SpeedReached, Standstill
 
-FOLDER = ROOT / "benchmarks" / "literature"
+FOLDER = ROOT / "experiments" / "literature"
 VERDICTS = {"reproduced", "refuted", "undecidable"}
 
 

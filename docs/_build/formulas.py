@@ -5,7 +5,7 @@ import pathlib
 import re
 from typing import Any
 
-ROOT = pathlib.Path(__file__).parent.parent
+ROOT = pathlib.Path(__file__).parent.parent.parent
 FORMULA = re.compile(r"^\$\$\s(?P<latex>[^$]+?)\s\$\$$", re.MULTILINE)
 CODE = re.compile(r"<(pre|code)\b.*?</\1>", re.DOTALL)
 VERSION = re.compile(r'^__version__ = "(.+)"$', re.MULTILINE)

@@ -1,6 +1,6 @@
 """Draw which package imports which, layer by layer: docs/figures/packages.png.
 
-    python docs/packages.py [folder of another checkout]
+    python docs/_build/packages.py [folder of another checkout]
 
 Prints how many packages (or loose modules), arrows and arrows upwards there are. Needs the groups `lint` and `plot`."""
 
@@ -12,7 +12,7 @@ from collections import defaultdict
 import grimp
 from matplotlib.figure import Figure
 
-ROOT = pathlib.Path(__file__).parent.parent
+ROOT = pathlib.Path(__file__).parent.parent.parent
 HEIGHT, WIDTH = 0.8, 11.0  # of a layer, of the figure [inch]
 
 

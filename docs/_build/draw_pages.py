@@ -1,6 +1,6 @@
 """Draw the figures of the pages that teach, by the commands and the code that the pages show.
 
-python docs/draw_pages.py        writes docs/figures/<page>.png"""
+python docs/_build/draw_pages.py        writes docs/figures/<page>.png"""
 
 import contextlib
 import os
@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
+ROOT = pathlib.Path(__file__).resolve().parents[2]
 FIGURES = ROOT / "docs" / "figures"
 NOISE = "--set solver.step=1e-3 --set sensor=noise --set sensor.slip=0.005"
 SWEEP = f"sweep slip-lmi --samples 1000 {NOISE} --figures --out noisy"
@@ -35,7 +35,7 @@ PAGES = {
 
 def main() -> None:
     """Draw all of them, each in a folder that goes away."""
-    sys.path.insert(0, str(ROOT / "tests"))
+    sys.path.insert(0, str(ROOT / "tests" / "support"))
     os.environ["MPLBACKEND"] = "Agg"
     import pages
 

@@ -10,8 +10,7 @@ from typing import Any
 
 # A newcomer looks for a part or an answer before a note on how the package is built. Other pages have weight 1.
 WEIGHTS = {"reference/": 2.0, "faq": 2.0, "design-notes/": 0.1}
-RESULTS = ("literature", "papers", "real-rig", "measured-rig", "adversary", "best-slip", "two-wheeler", "validation")
-WEIGHTS |= dict.fromkeys((*RESULTS, "test-status", "architecture", "compiler"), 0.3)
+WEIGHTS |= dict.fromkeys(("experiments/", "papers", "validation", "test-status", "architecture", "compiler"), 0.3)
 KEY = re.compile(r"\b(\w+)=\1\+(\w+)\+(\w+)\.id(?=\})")
 
 

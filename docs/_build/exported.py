@@ -6,7 +6,7 @@ import pathlib
 import re
 from typing import Any
 
-ROOT = pathlib.Path(__file__).parent.parent
+ROOT = pathlib.Path(__file__).parent.parent.parent
 MARK = re.compile(r"<!-- exported: ([\w.]+) -->")
 FAMILIES = ("plants", "roads", "controllers", "references", "actuators", "sensors", "objectives", "stops")
 TABLE_ONLY = "\n    options: {members: false, heading_level: 2}"  # the methods of a part are those of its contract
