@@ -1,8 +1,8 @@
-"""Ascent by gradients within the adversary's set: projected gradients, and Frank and Wolfe's steps.
+"""Ascent by gradients within the adversary's set: projected gradients, and steps of Frank and Wolfe.
 
-Of each start, after each gradient g, a few points are run: feasible(z + step d), d the gradient made one in each block;
-and z + share (p - z), p the point of the set that is farthest along g (`farthest`), to which a linear function would
-lead at once. The best of them is the next start.
+Each start moves as follows. A gradient g gives two kinds of points: feasible(z + step d), where d is g normalised in
+each block, and z + share (p - z), where p is the point of the set that is farthest along g (`farthest`). A linear
+function has its maximum at p. The best of all these points is the next start.
 """
 
 import numpy as np

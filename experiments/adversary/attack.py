@@ -1,4 +1,4 @@
-"""A controller under attack: overshoots of the adversary's points, their gradients, and what one costs in runs."""
+"""A controller under attack: overshoots of the adversary's points, gradients, and the price of a gradient in runs."""
 
 import dataclasses
 import time

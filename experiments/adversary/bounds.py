@@ -1,13 +1,14 @@
-"""What the adversary of `run.py` may do: his set, fixed before the first search.
+"""The adversary's set, fixed before the first search.
 
-He chooses 124 numbers: 58 factors of the friction along the road (a cubic spline of the distance), 64 errors of the
-measured slip, one for each millisecond, which repeat, and mass and speed of the start. In units of their bounds:
+The adversary chooses 124 numbers: 58 factors of the friction along the road (a cubic spline of the distance), 64 errors
+of the measured slip, and mass and speed of the start. Each error lasts a millisecond, and the 64 repeat. In units of
+their bounds:
 
-    road    |z_i| <= 1,  |z_(i+1) - z_i| <= steepest:   factors 1 + height z, a road and no noise
+    road    |z_i| <= 1,  |z_(i+1) - z_i| <= steepest:   factors 1 + height z
     noise   mean 0, root mean square at most 1, |z_k| <= peak:   errors deviation z
     start   |z| <= 1:   mass and speed from one end of the box of `real_rig` to the other
 
-`feasible` brings any numbers into the set, and is what every search uses. README.md has the same in a table.
+`feasible` brings any numbers into the set; every search uses it. README.md has the same in a table.
 """
 
 import dataclasses

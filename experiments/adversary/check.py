@@ -1,8 +1,8 @@
-"""Whether what was found is real: with shorter steps, by differences, and by another program.
+"""Check the worst runs of the searches: with shorter steps, by differences, and by another program.
 
-`elsewhere` integrates the same run by SciPy (Dormand and Prince of order 8, tolerance 1e-10, SciPy's own B-spline),
-sample by sample, from the parameters alone: the plant of Maeda and Sugiura, a gain in proportion to the speed with
-back-calculation, and the target that is limited. Nothing of diffabs but its parameters is used there.
+`elsewhere` integrates the same run by SciPy (Dormand and Prince of order 8, tolerance 1e-10, SciPy's own B-spline), one
+sample of the controller after the other. It writes out the plant of Maeda and Sugiura, a gain in proportion to the
+speed with back-calculation, and the rate limit of the target. From diffabs it takes parameters only.
 """
 
 import math

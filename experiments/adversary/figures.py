@@ -1,4 +1,4 @@
-"""The figures of `run.py`."""
+"""The figures of the study."""
 
 from collections.abc import Mapping
 from typing import Any

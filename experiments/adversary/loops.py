@@ -1,5 +1,7 @@
-"""The loops of `run.py`: the rig of `real_rig`, its speed known, on the adversary's road and with his noise in
-place of what is drawn there, around the controllers that he is set on."""
+"""The loops under attack: the rig of `real_rig` with known speed, around several controllers.
+
+The road and the noise of the adversary replace those that `real_rig` draws.
+"""
 
 import dataclasses
 from typing import Any

@@ -1,5 +1,6 @@
-"""Tuning against the adversary: a few rounds of finding what is worst for the gains as they are, and of tuning them
-against everything that was found so far, and random points.
+"""Tuning against the adversary, in rounds: find the worst points for the present gains, then tune the gains.
+
+A round tunes over all points of the rounds before, and over random points:
 
     minimise over gains   CVaR over lanes (overshoot + weight IAE)
 

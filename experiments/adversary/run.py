@@ -1,13 +1,12 @@
-"""A worst case worth a gradient: an adversary who chooses a road, a noise and a start, 124 numbers, against each
-controller of the rig.
+"""An adversary chooses road, noise and start, 124 numbers, against each controller of the rig.
 
-His set was fixed before the first search (`bounds.py`). Gradients look for his worst point at the same cost as
-CMA-ES, random points and corners (`search.py`, `ascent.py`); what was found is run again with
-shorter steps and by SciPy (`check.py`); the tuned controller is tuned against it (`minmax.py`).
+`bounds.py` fixed the set before the first search. Gradients, CMA-ES, random points and corners look for the worst point
+at equal cost (`search.py`, `ascent.py`). Shorter steps and SciPy check the worst runs (`check.py`). Then the tuned
+controller is tuned against the adversary (`minmax.py`).
 
     OPENBLAS_NUM_THREADS=1 python experiments/adversary/run.py
 
-Threads of BLAS do nothing for matrices of 124 rows but take ten times as long in CMA-ES.
+One thread of BLAS suffices for matrices of 124 rows. With more threads CMA-ES takes ten times as long.
 """
 
 import dataclasses

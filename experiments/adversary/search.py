@@ -1,7 +1,7 @@
-"""Four ways to look for the adversary's worst point at equal cost: gradients, CMA-ES, random points, corners.
+"""Four searches for the adversary's worst point at equal cost: gradients, CMA-ES, random points, corners.
 
-The cost is counted in simulated runs; a gradient counts as many as it takes the time of (`Attack.priced`). The searches
-of all seeds go on side by side, as lanes of one batch. Every point that is run is in the set, by the same `feasible`.
+The cost is a number of simulated runs. A gradient counts as the runs that take its time (`Attack.priced`). The searches
+of all seeds run side by side, as lanes of one batch. `feasible` brings each point into the set.
 """
 
 import dataclasses

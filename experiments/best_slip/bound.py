@@ -1,16 +1,16 @@
-"""The shortest stop of a car on a road of `pid_over_roads`, whatever controls its brake.
+"""The shortest stop of a car on a road of `pid_over_roads`, under any control of its brake.
 
-With ds/dtau = F(s, u) = (r/J)(u - r mu m g) - (1 - s) mu g, d ln v/dtau = -mu g, dx/dtau = v^2 and dt = v dtau the slip
-does not depend on the speed. F grows with the torque u, so from slip 0 no torque brings more slip at any tau than the
-whole one, and up to the peak more slip is more friction: at every place no car is slower than the one braked with all
-the torque until its slip is at the peak and held there, or, where that is too much for the torque, at the most that it
-can hold. On one surface that car is possible: the bound is attained, and is
+Let F(s, u) = (r/J)(u - r mu m g) - (1 - s) mu g and dt = v dtau. Then ds/dtau = F, d ln v/dtau = -mu g and dx/dtau =
+v^2, so the slip does not depend on the speed. F grows with the torque u. So from slip 0 the whole torque gives the
+greatest slip at any tau. Up to the peak more slip is more friction. The car that is slowest at every place therefore
+brakes with the whole torque up to the peak, and holds the peak. If the torque is too weak for the peak, it holds the
+greatest slip that it can. On one surface such a stop exists, and the bound is
 
     x = int_0^s1 v^2/F ds + v1^2/(2 mu(s1) g),    v = v0 exp(-int_0^s mu g/F ds),    s1 the peak, or the root of F
 
-and not v0^2/(2 mu_max g), `friction`, which has the peak's friction from the first instant. A road with an edge (its
-surfaces mix over `width`) is at its best as that car up to the edge and from there on at the friction of each place's
-peak, which no car reaches at once, nor where the torque does not suffice: there it is a bound that nobody attains.
+The simpler v0^2/(2 mu_max g), `friction`, has the peak's friction from the first instant. On a road with an edge
+(surfaces mix over `width`) the bound takes that car up to the edge. Behind the edge it takes the friction of each
+place's peak. No car changes its slip at once, so no stop attains the bound there.
 """
 
 from collections.abc import Mapping

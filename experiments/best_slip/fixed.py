@@ -1,15 +1,19 @@
-"""What `run.py` judges by, fixed before anything was run: roads, errors of the sensors, what counts and how.
+"""Roads, errors of the sensors and criterion of `best_slip`, fixed before the first run.
 
-The roads and cars are those of `pid_over_roads` (its `family`, its seeds, so its 2,048 held-out roads), each lane
-with its bound (`bound.py`). Either the slip and the deceleration are measured exactly, or the vehicle's speed
-is the integral of an accelerometer with noise and a bias, and the slip is computed with it: noise 0.1 m/s^2 at 1 kHz,
-bias within 0.05 m/s^2 and the floor of 4 m/s in the slip's denominator, all three out of `slip_estimator/noise.py`.
+Roads and cars are those of `pid_over_roads`, with its 2,048 held-out roads. Each lane has its bound (`bound.py`).
+Either sensors are exact, or the vehicle's speed is the integral of an accelerometer and gives the slip. The
+accelerometer has noise of 0.1 m/s^2 at 1 kHz and a bias within 0.05 m/s^2. The speed in the slip's denominator is at
+least 4 m/s. These three numbers come from `slip_estimator/noise.py`.
 
-A lane fails if it does not reach the stop in time, diverges, or locks (slip above 0.99, however shortly). Failures are
-counted and never averaged in. A rule's figure is the mean of distance/bound - 1 over the lanes that it stops; the gain
-on another rule is the mean over the lanes that both stop of (its distance - the rule's)/bound, with a t interval. The
-best rule is, of those that fail on at most 1 % of the lanes, the one with the least mean over the lanes that all of
-them stop. It is asked for exact sensors, and for sensors with errors, separately: tuned and judged under the same.
+- A lane fails if it does not stop in time, diverges, or locks (slip above 0.99, however shortly). Failures are counted,
+  no mean includes them.
+- The figure of a rule is the mean of distance/bound - 1 over the lanes that it stops.
+- Its gain on another rule is the mean of (the other's distance - its own)/bound, over the lanes that both stop, with a
+  t interval.
+- Rules that fail on more than 1 % of the lanes cannot be best. The best of the others has the least mean over the lanes
+  that all of these stop.
+
+Each kind of sensor has its own best rule, tuned and judged with that sensor.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""The rules of `run.py`: where the target slip comes from. PI and brake are those of Aoki and Nakamura."""
+"""The rules for the target slip. PI and brake are those of Aoki and Nakamura."""
 
 import dataclasses
 from collections.abc import Iterator

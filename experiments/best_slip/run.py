@@ -1,12 +1,9 @@
-"""What does the best rule for the slip reach between the paper's estimator and what physics allows?
+"""Which rule for the target slip comes nearest to the shortest possible stop?
 
-Aoki and Nakamura take the slip at the greatest deceleration for their target. Over 2,048 roads that nobody has tuned
-for, one fixed slip, tuned, was shorter. Here each rule has its chance: the paper's latch, the latch for noisy sensors,
-extremum seeking, one fixed slip, a slip by the measured deceleration; each tuned by gradients on the same roads with
-the same search, with the PI and its anti-windup, for exact sensors. What was found is judged with exact sensors, and
-with an accelerometer that has noise and a bias; with `rules` it can be tuned for that, too.
-Distances are relative to the shortest that each road allows a brake of 90 N m (`bound.py`). What is judged
-and how was fixed before the first run (`fixed.py`).
+Aoki and Nakamura target the slip at the greatest deceleration. The study compares five rules: their latch, a latch for
+noisy sensors, extremum seeking, one fixed slip, and a slip by the measured deceleration. Gradients tune each rule on
+the same roads, with the PI and its anti-windup, for exact sensors. `rules` tunes for noise and bias, too. Distances
+are relative to the shortest stop of each road with a brake of 90 N m (`bound.py`). `fixed.py` has the criterion.
 
     python experiments/best_slip/run.py
 """

@@ -1,5 +1,7 @@
-"""How `run.py` tunes a rule: gradients from several starts on a few roads, from the best of them on all; and how
-that is checked: CMA-ES from the same start, and differences in place of derivatives."""
+"""The tuning of a rule by gradients: several starts on a few roads, then all roads from the best of them.
+
+CMA-ES from the same start, and central differences, check it.
+"""
 
 import dataclasses
 import time

@@ -1,4 +1,4 @@
-"""Figures of `run.py`: the curves that the tables leave, and what those leave of the tables."""
+"""Figures of the identification: the curves, and the residuals of the tables."""
 
 from typing import Any
 

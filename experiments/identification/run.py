@@ -1,12 +1,12 @@
-"""What do Tables 1 and 2 of Aoki and Nakamura say about the friction curve and the wheel's inertia? Neither is printed.
+"""The friction curve and the wheel's inertia from Tables 1 and 2 of Aoki and Nakamura, which print neither.
 
-Least squares on stopping times and distances, with gradients through the runs, the estimator's latch included:
+Least squares on stopping times and distances, with gradients through the runs and the estimator's latch:
 
-  (a) Magic Formula and inertia, five parameters, from several stated priors. A prior first holds the fit (the tables'
-      deviations are taken ten and three times too large) and then lets it go: the result owes nothing to it but the
-      basin. The deviations are .01 s and .06 m: what the formula leaves is its own error, not that of rounding.
-  (b) a spline, 16 heights, the slip of its peak and the inertia, as many unknowns as there are different numbers. A
-      prior of smoothness about a blend of (a) with each stated curve decides what the tables leave open.
+  (a) Magic Formula and inertia, five parameters, from several priors. A prior holds the fit at first: the tables'
+      deviations are ten and three times too large. Then it lets go, so only the basin depends on it. The deviations,
+      0.01 s and 0.06 m, are errors of the formula, not of rounding.
+  (b) A spline (16 heights), the slip of its peak and the inertia: as many unknowns as different numbers. A smoothness
+      prior about a blend of (a) with each stated curve decides the rest.
 
     python experiments/identification/run.py
 """

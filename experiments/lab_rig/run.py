@@ -1,15 +1,11 @@
-"""What does the laboratory rig do, and what does its brake's 49 ms lag do to the published gain?
+"""The laboratory rig at constant commands, and the published gain behind a brake with a lag of 49 ms.
 
-First the rig itself, braked without control from 50 km/h: static and derivative checks, then runs at constant commands.
-Then the mirrored rig of Maeda and Sugiura under their gain, with the brake's lag T in front of it:
+First come checks of the rig itself: forces, derivatives, and stops from 50 km/h. Then the mirrored rig of Maeda and
+Sugiura runs under their gain, with the brake's lag T in front of it:
 
     x1' = x2,   omega x2' = alpha x2 + beta u,   T u' = k1 x1 + k2 x2 - u
 
-which Routh and Hurwitz find stable for T below T* = (beta |k2| - alpha)/(beta |k1| + alpha (beta |k2| - alpha)/omega).
-
-That is 4.02 ms at 50 km/h and 3.94 ms at 5 km/h; above 4.03 ms no speed is stable. With 49 ms the wheel locks at
-0.078 s where the brake can only brake, at 0.16 s where negative torque is allowed, and at the rig's 0..9.03 N m it
-swings between rolling freely and a slip of 0.8, and locks near the end.
+By Routh and Hurwitz it is stable for T below (beta |k2| - alpha)/(beta |k1| + alpha (beta |k2| - alpha)/omega).
 
     python experiments/lab_rig/run.py
 """

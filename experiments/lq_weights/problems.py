@@ -1,14 +1,13 @@
-"""The problems of `lq_weights.py`, each a function that returns one, and all their numbers.
+"""The problems of the study, each from a function of its own, with all their numbers:
 
-gain       (k1, k2) of the rig, over masses and speeds
-Riccati    Q = L L', R = 1, through the regulator of the rig at 20 km/h
-LMI        the same through the paper's robust design over masses and speeds: every trial is a robust gain
-schedule   gains at six speeds and the filter of the target: 13, many of which hardly matter
-table 6    gains at six speeds, over the first half second from 24 speeds, so that every gain matters: 12
-table 12   the same at 12 speeds: 24
-table 24   the same at 24 speeds: 48
-together   Q at six speeds through six Riccati equations, feed-forward, filter of the target, anti-windup: 15
-eight      PID, derivative filter, anti-windup, reference and estimator of the quarter car on 64 roads: 8
+- gain: (k1, k2) of the rig, over masses and speeds.
+- Riccati: Q = L L', R = 1, through the regulator of the rig at 20 km/h.
+- LMI: the same through the paper's robust design over masses and speeds. Every trial is a robust gain.
+- schedule: gains at six speeds and the filter of the target, 13 numbers. Many hardly matter.
+- table 6: gains at six speeds, 12 numbers. Runs of half a second begin at 24 speeds, so every gain matters.
+- table 12, table 24: the same with gains at 12 and 24 speeds, 24 and 48 numbers.
+- together: Q at six speeds through six Riccati equations, feed-forward, target filter, anti-windup, 15 numbers.
+- eight: PID, derivative filter, anti-windup, reference and estimator of the quarter car, 8 numbers, on 64 roads.
 """
 
 import dataclasses

@@ -1,16 +1,16 @@
-"""Is it worth while to differentiate? Gains, and LQ weights through the Riccati equation and through the LMI.
+"""What is a gradient worth? Searches with and without derivatives tune gains and LQ weights.
 
-What derivatives are worth is what the same search takes on derivatives and on forward differences: SciPy's L-BFGS-B.
-Beside it stand `diffabs.tune`, Nelder-Mead, and CMA-ES at the best of several first steps, chosen afterwards for each
-accuracy. `searches.py` says how they are counted, `problems.py` which problems of 2 to 48 parameters there are.
+SciPy's L-BFGS-B runs on gradients and on forward differences. Beside it stand `diffabs.tune`, Nelder-Mead, and CMA-ES
+at the best of several first steps, chosen afterwards for each accuracy. `searches.py` counts them, `problems.py` has
+the problems of 2 to 48 parameters, through the Riccati equation or the LMI in some.
 
-What counts is rollouts of the batch until the objective is within a hundredth, a ten thousandth and a millionth of the
-way from the start to the best that any search found. A gradient counts at its price over a rollout that measures
-nothing but the objective.
+The study counts rollouts of the batch until the objective is near the best of all searches: within a hundredth, a ten
+thousandth or a millionth of the way from the start. A gradient counts at its price over a rollout that measures the
+objective only.
 
     python experiments/lq_weights/run.py searches [PROBLEM ...]    (needs the package cma, of the dependency group test)
 
-Each problem is kept in a file of its own; table and figure show all that are there.
+Each problem has a file of results. Table and figure show all files.
 """
 
 import dataclasses

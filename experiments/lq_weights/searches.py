@@ -6,11 +6,11 @@
     Nelder-Mead             SciPy's, with coefficients adapted to the dimension from three parameters on
     CMA-ES                  the reference implementation (cma), its own population size, several first steps
 
-The price of a gradient is the median of ratios of processor times, gradient over value, measured alternately; in
-forward mode or reverse mode, whichever is cheaper. Both measure nothing but the objective. All searches start from the
-same point. A point counts as found if its run did not diverge and its integration step is stable. Searches without
-derivatives are asked about the step only where a value would be their least and z has moved by NEAR since they were
-asked last, because the answer takes longer than a short run."""
+The price of a gradient is a median of ratios of processor times, gradient over value, measured alternately. It is that
+of the cheaper mode, forward or reverse. Both measure the objective only. All searches have the same start. A point
+counts if its run does not diverge and its integration step is stable. This check takes longer than a short run. So in
+searches without derivatives it waits for a new least value at a distance of NEAR from the last check.
+"""
 
 import dataclasses
 import statistics

@@ -6,9 +6,8 @@
     trust-exact         a Hessian at every step, in a trust region
 
 Gradients come from a kernel. A Hessian is p forward differences of them and counts as p gradients, for p parameters.
-The exact one, forward mode over forward mode by XLA, agrees with it and costs more: `--exact` prints by how much, in
-processor time. All searches have equal starts and budgets. A search has reached an accuracy where its objective is at
-most that part above the best of all searches from its start.
+The exact Hessian, forward mode over forward mode by XLA, agrees and costs more: `--exact` prints its processor time.
+All searches have equal starts and budgets. An accuracy is relative to the best of all searches from a start.
 
     python experiments/lq_weights/run.py second-order [PROBLEM ...] [--starts 3] [--budget 150] [--exact]
 """

@@ -1,9 +1,8 @@
 """How often does a 95 % interval of a mean cover it, for skewed laws and few samples?
 
-The interval of the package is the hull of Hall's and Student's (`diffabs/sweep/statistics/estimates.py`). Each number
-is in percent of 10,000 samples, with a standard error of at most 0.5.
-"warned": the samples that `diffabs sweep` names as skewed, by `MAX_SKEWNESS` of `summary.py`. "length": median length
-over that of Student's interval.
+The package reports the hull of Hall's and Student's intervals (`diffabs.sweep.statistics.estimates`). Each number is in
+percent of 10,000 samples, with a standard error of at most 0.5. "warned" counts the samples that `diffabs sweep` calls
+skewed, by `MAX_SKEWNESS`. "length" is the median length over that of Student's interval.
 
     python experiments/mean_intervals/run.py
 """

@@ -1,12 +1,12 @@
-"""Which effects does the measured laboratory rig have, and what does the identified rig mean for the controllers?
+"""Which effects does the measured laboratory rig have, and how do controllers do on the identified rig?
 
-Effects are added one at a time. Each is fitted to the first half of experiment 1 and judged by the second half, under
-the recorded commands. An effect stays if it lowers the wheel's error there by 5 %, does not raise the slip's, and its
-parameters differ from zero by two standard deviations. Then all of experiment 1 is fitted with the effects that stay.
-Experiment 2 judges: nothing is fitted to it. A fit from ten starts shows the minima, without and with the compliance of
-tyre and belt.
+The study adds effects one at a time, fits each to the first half of experiment 1, and judges by the second half, under
+the recorded commands. An effect stays under three conditions. It lowers the wheel's error there by 5 %, it does not
+raise that of the slip, and its parameters differ from zero by two standard deviations. Then all of experiment 1 is
+fitted with the effects that stay. Experiment 2 judges; no fit uses it. Fits from ten starts show the minima, without
+and with the compliance of tyre and belt.
 
-Last, controllers run on the rig as its mask describes it and as it was identified (README.md).
+Last, controllers run on the rig of the maker's mask and on the identified rig (README.md).
 
     python experiments/measured_rig/run.py [PART ...] [--data FOLDER]
 """

@@ -1,4 +1,4 @@
-"""Figures of `run.py`: before and after."""
+"""Figures of the study: slip and torque before and after tuning."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,15 +1,15 @@
-"""Can the overshoot of Maeda and Sugiura be cured on a rig with a real actuator and a computer, and the cure be proved?
+"""Can the overshoot of Maeda and Sugiura be cured with a real actuator and a computer, and the cure be proved?
 
-Their gain overshoots its target by 54 %, by 82 % once the torque has limits, and they leave open why. Here the rig is
-what the paper leaves out: torque 0 to 9.03 N m, an actuator lag of 1 ms, a controller sampled at 1 kHz that knows the
-holding torque of a mass of 5.75 kg only, whatever the mass is. What is tuned, by gradients through 9 runs at once, is
+Their gain overshoots the target by 54 %, with torque limits by 82 %. Here the rig has torque limits of 0 and 9.03 N m
+and an actuator lag of 1 ms. The controller runs at 1 kHz and assumes a mass of 5.75 kg in the holding torque tau*.
+Gradients through 9 runs tune k1, k2 and T of
 
     u = tau*(5.75 kg) + (v/v0) (k1 x1 + k2 x2),   T target' = 0.2 - target
 
-under constraints on overshoot and certified decay. It is judged by the worst over a box of masses and speeds that
-includes its corners, beside the published gain, the LMI's, the known cures, and itself with one ingredient missing; and
-each of them where one thing is not as it was designed for (`weak_spots.py`). The certificate is one Lyapunov matrix for
-all masses, all speeds from 5 to 50 km/h, and every course of the speed that friction allows.
+under constraints on overshoot and certified decay. The criterion is the worst run over a box of masses and speeds that
+includes its corners. The study compares the published gain, LMI gains, known cures, and the cure without each of its
+ingredients. `weak_spots.py` adds one deviation at a time. The certificate is one Lyapunov matrix for all masses, all
+speeds from 5 to 50 km/h, and every course of the speed that friction allows.
 
     python experiments/overshoot_cured/run.py
 """

@@ -1,10 +1,10 @@
-"""Where is a controller of the rig weak? One thing at a time is not as it was designed for, everywhere in its box.
+"""Where is a controller of the rig weak? One deviation at a time, everywhere in its box.
 
-The box, masses and speeds of the start, is fixed before anything is tuned and includes its corners. What goes wrong is
-faster starts than the box has, friction, brake lag and inertia, a computer that takes its time, noise, and a vehicle
-speed that is seen low. The overshoot is that of the true slip: a speed seen 1 % low alone holds the slip at 0.208.
+The box of masses and start speeds includes its corners, and was fixed before the tuning. The deviations are faster
+starts, friction, brake lag, inertia, computing delay, noise, and a vehicle speed that is measured low. The overshoot
+is that of the true slip: a speed measured 1 % low alone holds the slip at 0.208.
 
-`run.py` prints this beside each controller.
+`run.py` prints the result for each controller.
 """
 
 import dataclasses

@@ -1,14 +1,16 @@
-"""What are the best PID gains of Aoki and Nakamura, not on one road, but on hundreds?
+"""Which PID gains of Aoki and Nakamura are best on hundreds of roads?
 
-On one known road a fixed target slip, tuned, beats any estimator. So gains are tuned by gradients over a family: peak
-friction 0.1 to 1.1 at slips 0.05 to 0.2, curves of many shapes, two thirds of the roads with a patch of another
-surface, cars of 12 to 20 kg, 40 to 120 km/h. Each run counts with its distance relative to the shortest that friction
-allows. Conventional control has one target slip for all roads, and tunes it; the proposed one finds it from the
-deceleration, with the estimator that survives sensor noise. The paper's own car and road (the Magic Formula identified
-from its tables) have a fifth of the weight. The estimator makes the objective kinked: which run latches when depends
-on the gains. So its descent starts from the best of a screening: thousands of gains on the paper's own road, and of
-those near the bound some on a few roads of the family. All are judged on roads that neither tuning nor screening has
-seen, with and without sensor noise, and on the paper's own road as a spline, to standstill.
+Gradients tune the gains over a family of roads and cars. Peak friction is 0.1 to 1.1 at slips of 0.05 to 0.2, curves
+have many shapes, and two thirds of the roads have a patch of another surface. Cars have 12 to 20 kg and 40 to 120
+km/h. A run counts with its distance over the shortest that friction allows. The paper's own car and road (the Magic
+Formula identified from its tables) have a fifth of the weight.
+
+Conventional control tunes one target slip for all roads. Proposed control finds it from the deceleration, by the
+estimator for noisy sensors. The latch of the estimator makes the objective kinked. So its descent starts from the best
+of a screening: thousands of gains on the paper's own road, then the best of them on a few roads of the family.
+
+The gains are judged on other roads, with and without sensor noise, and on the paper's own road (a spline) to
+standstill.
 
     python experiments/pid_over_roads/run.py
 """

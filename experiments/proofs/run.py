@@ -1,14 +1,14 @@
-"""What can be proved about the nonlinear loop: a tube over runs, the errors that the cure bears, a tuning with proofs.
+"""Proofs about the nonlinear loop: a tube over runs, errors that the cured loop bears, a tuning with proofs.
 
-`diffabs prove` decides a claim about every run of a box. Three uses of it for the rig of Maeda and Sugiura at 50 km/h,
-for every mass from 5.3 to 6.2 kg:
+`diffabs prove` decides a claim about every run of a box. The study uses it for the rig of Maeda and Sugiura at 50
+km/h, for every mass from 5.3 to 6.2 kg:
 
-1. A picture: the tube that is proved for the published gain with torque limits, over 1,000 simulated runs.
-2. The errors that the cured loop (`slip-cured`) bears, with an overshoot of at most 5 %. A wrong factor of the
-   vehicle's speed is one more parameter of the box. A quantised slip is a disturbance of at most half a step at each
-   sample. So the proof holds for every measurement error of that size.
-3. A tuning in which a proof is the constraint: the filter of the target and the gain, so that the cured loop settles
-   soonest and its overshoot is proved to be at most 1 %.
+1. The tube that is proved for the published gain with torque limits, over 1,000 simulated runs.
+2. The errors that the cured loop (`slip-cured`) bears with an overshoot of at most 5 %. A wrong factor of the speed is
+   one more parameter of the box. A quantised slip is a disturbance of at most half a step at each sample, so the
+   proof holds for every error of that size.
+3. A tuning of the target filter and the gain. The cured loop settles soonest, and a proved overshoot of at most 1 % is
+   the constraint.
 
     python experiments/proofs/run.py
 """

@@ -1,4 +1,4 @@
-"""The controllers of `controllers/`, which `run.py` found: judged and proved again, without the tuning.
+"""Judge and prove the controllers in `controllers/` again, without the tuning.
 
 python experiments/real_rig/run.py again
 """

@@ -1,8 +1,9 @@
-"""The rig as it really is: the box of `run.py`, fixed before anything was run on it.
+"""The box of the study, fixed before the first run: the unknowns of the rig.
 
-What a controller does not know, each within its range, independent and uniform; what is the same everywhere stands in
-`Fixed`. The vehicle's speed is either known, with an error that drifts, or estimated from the wheel's speed and an
-accelerometer. README.md has the same numbers in a table."""
+Each unknown is uniform within its range, and independent of the others. `Fixed` has the known numbers. The vehicle's
+speed is either known, with an error that drifts, or estimated from the wheel's speed and an accelerometer. README.md
+has the same numbers in a table.
+"""
 
 import dataclasses
 import itertools

@@ -1,6 +1,7 @@
-"""A controller of `run.py` as difference equations with every parameter: what another program needs to run it.
+"""A controller of the study as difference equations with every parameter, for other programs.
 
-tests/experiments/test_real_rig.py does that, in NumPy, from the file alone."""
+tests/experiments/test_real_rig.py runs these documents in NumPy, from the file alone.
+"""
 
 from typing import Any
 

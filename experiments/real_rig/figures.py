@@ -1,4 +1,4 @@
-"""The figures of `run.py`."""
+"""The figures of the study."""
 
 import dataclasses
 from typing import Any

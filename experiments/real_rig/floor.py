@@ -1,15 +1,16 @@
-"""What no gain can do about a vehicle speed that is seen wrong.
+"""The overshoot that every gain has if the vehicle's speed is measured wrong.
 
-The speed is seen as (1 + e) v. Who holds the slip that he sees at s* has w = (1 - s*)(1 + e) v, that is a true slip of
+The measured speed is (1 + e) v. A controller that holds the measured slip at s* has w = (1 - s*)(1 + e) v, so a true
+slip of
 
     1 - w/v = s* - (1 - s*) e,     an overshoot of  -e (1 - s*)/s* = -4 e  at s* = 0.2:
 
-3 % seen low is 12 % of overshoot, whatever the gain. An estimate that integrates an accelerometer with a bias b, seen
-decelerations being too high by b, has e = -b t/v, which is worst at the end. Noise, quantisation and the first
-approach come on top; they are what a controller can do something about.
+A speed measured 3 % low is 12 % of overshoot, under any gain. The integral of an accelerometer whose bias b makes
+decelerations too high has e = -b t/v, worst at the end. Noise, quantisation and the first approach add to this floor. A
+controller can reduce these.
 
-Who settles below his target is left of that floor and holds nothing. `Deviation` counts what is below as well, once
-there was time to get there; its floor is that of |e|.
+A controller that settles below its target undercuts the floor but does not hold the slip. `Deviation` counts both
+sides, after the time of the first approach; its floor is that of |e|.
 """
 
 import math

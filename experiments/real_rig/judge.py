@@ -1,4 +1,4 @@
-"""How a controller of `run.py` fares: at its weak spots, in the corners of the box, and on many points of it."""
+"""The judgement of a controller: at its weak spots, in the corners of the box, and on many points of it."""
 
 import dataclasses
 from typing import Any

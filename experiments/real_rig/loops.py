@@ -1,4 +1,4 @@
-"""The loops of `run.py`: the rig of the box around any controller, its speed known or estimated."""
+"""The loops of the study: the rig of the box around any controller, its speed known or estimated."""
 
 import dataclasses
 from typing import Any

@@ -1,5 +1,4 @@
-"""What `run.py` compares with: the published gain, robust designs, the first cure, sliding mode, and the PI that
-searches without gradients find."""
+"""The other controllers: published gain, robust designs, first cure, sliding mode, and a PI tuned without gradients."""
 
 import dataclasses
 import itertools

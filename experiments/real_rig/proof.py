@@ -1,22 +1,22 @@
-"""What can be proved of the controllers of `run.py`: the sampled loop with lag and computing delay, over the box.
+"""Proofs about the controllers of the study: the sampled loop with lag and computing delay, over the box.
 
-States: integral of the slip error, slip error, torque of the brake, torque of the last sample. In a run only the speed
-varies (and how fast it falls, and where on the friction curve the error of the speed puts the wheel); mass, inertia,
-friction, lag and delay are constant. So the box is cut into cells of lag and delay, and a Lyapunov matrix for each cell
-proves the whole; within a cell everything may vary at will.
+The states are integral of the slip error, slip error, torque of the brake, torque of the last sample. Mass, inertia,
+friction, lag and delay are constant in a run. The speed varies, and with it the rate of its fall and the place on the
+friction curve. So the box is cut into cells of lag and delay. Within a cell everything may vary at will. A Lyapunov
+matrix for each cell proves the whole.
 
-A controller in proportion to the speed as it is seen cancels the error of that speed: the slip as it is seen moves by
-v/v_seen of the true one, and the gain is v_seen/v of what it should be. A fixed gain is off by that error, which is a
-range of the inertia.
+A controller in proportion to the measured speed cancels the error of that speed: the measured slip moves by v/v_seen of
+the true one, the gain is v_seen/v times the right one. Under a fixed gain the error acts like a range of the inertia.
 
-A cell is covered by hulls of matrices, one for each range of the speed, because one hull of all speeds has vertices
-that are no machine. A common P of all vertices is a proof. What fails at a vertex says nothing of a machine, so
-instability and the absence of a common P are looked for among machines: the systems at points of the cell. Verdicts:
+Hulls of matrices cover a cell, one for each range of the speed: one hull of all speeds has vertices that are no
+machine. A common P of all vertices is a proof. A vertex that fails proves no instability. So instability and the
+absence of a common P are looked for among machines, the systems at points of the cell. Verdicts:
 
     proved      every cell: the vertices of its hulls have a common P
     unstable    a machine has a pole outside of the unit circle, at a frozen speed
     refuted     in a cell the machines themselves have no common P
-    undecided   the machines have a common P, the vertices have none"""
+    undecided   the machines have a common P, the vertices have none
+"""
 
 import dataclasses
 import itertools

@@ -1,11 +1,11 @@
-"""Is the overshoot cured on the rig as it really is, everything wrong at once?
+"""Is the overshoot cured on the rig as it really is, with every error at once?
 
-The box of what a controller does not know was fixed beforehand (`box.py`, README.md). Estimator of the
-speed, reference and controller are tuned together, by gradients over thousands of lanes (`tune.py`), beside
-what others find (`others.py`), what no gain can do (`floor.py`) and what can be proved
-(`proof.py`), and judged at weak spots, in all corners and on 100,000 points (`judge.py`).
+`box.py` fixed the unknowns beforehand. Gradients over thousands of lanes tune estimator, reference and controller
+together (`tune.py`). Beside them stand other controllers (`others.py`), the floor that no gain undercuts (`floor.py`),
+and proofs (`proof.py`). `judge.py` judges at weak spots, in all corners and on 100,000 points.
 
     python experiments/real_rig/run.py
+    python experiments/real_rig/run.py again     # the committed controllers, without the tuning
 """
 
 import dataclasses

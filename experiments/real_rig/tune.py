@@ -1,4 +1,4 @@
-"""Estimator, reference and controller of `run.py` tuned together by gradients, over thousands of lanes."""
+"""Estimator, reference and controller, tuned together by gradients over thousands of lanes."""
 
 import dataclasses
 from collections.abc import Callable, Mapping

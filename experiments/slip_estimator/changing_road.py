@@ -1,9 +1,8 @@
 """Does the estimator of Aoki and Nakamura find the best slip of a road that changes under the car?
 
-That is the aim of their introduction: the slip of greatest friction changes with the road from moment to moment, so it
-has to be estimated during the stop. The paper's car (15 kg, from 100 km/h, the Magic Formula identified from its
-tables) brakes on its own road up to an edge. Behind it lies a more slippery surface, whose peak lies at another slip.
-The bound of each stop is that of `best_slip/bound.py`, whatever controls the brake.
+Their introduction aims at this: the best slip changes with the road, so it has to be estimated during the stop. The
+paper's car (15 kg, from 100 km/h, the Magic Formula identified from its tables) brakes on its own road up to an edge.
+Behind it lies a more slippery surface, whose peak lies at another slip. `best_slip/bound.py` bounds each stop.
 
     python experiments/slip_estimator/run.py changing-road
 """

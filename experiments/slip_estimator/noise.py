@@ -1,16 +1,17 @@
-"""What does a real accelerometer do to the slip estimator? The other question that Aoki and Nakamura leave for later.
+"""How does a real accelerometer, with noise and bias, affect the slip estimator?
 
 Noise: the latch takes the first fall of the deceleration for its maximum, and noise makes it fall at once. `PeakRobust`
 low-passes deceleration and slip alike, waits for a fall of a few percent, and is armed above 3 m/s^2. Which time
 constant and threshold work? A threshold above the fall from the peak to the first target, 8 % here, never latches.
 
-Bias: the vehicle's speed is the accelerometer's integral. A forward bias b makes it b t too fast, and slip near
-standstill large, which releases the brake. A floor on the speed in the slip's denominator keeps the error of the slip
-below b t/floor, so the car under a fixed target stops if the floor exceeds about b t_stop/slip. The estimator goes by
-the size of the acceleration, as in the paper: a forward bias of 0.02 m/s^2 shows an acceleration before the wheel
-slips, whose size falls through zero and is taken for the maximum. The target becomes a slip of 0, and at 5 kHz no floor
-helps: the car rolls on (sampled more slowly, it misses the fall of a small bias). `PeakRobust` is armed above 3 m/s^2
-and, with a floor of 4 m/s, stops in 43.96 m at 0.1 m/s^2, not at 0.2.
+Bias: the vehicle's speed is the accelerometer's integral. A forward bias b makes it b t too fast. Near standstill the
+slip is then large, which releases the brake. A floor on the speed in the slip's denominator keeps its error below
+b t/floor. Under a fixed target the car stops if the floor exceeds about b t_stop/slip.
+
+The estimator takes the size of the acceleration, as in the paper. A forward bias of 0.02 m/s^2 shows an acceleration
+before the wheel slips. Its size falls through zero, and the latch takes it for the maximum. The target becomes a slip
+of 0, and at 5 kHz no floor helps: the car rolls on. Sampled more slowly, the latch misses the fall of a small bias.
+`PeakRobust` with a floor of 4 m/s stops in 43.96 m at 0.1 m/s^2, and does not stop at 0.2.
 
     python experiments/slip_estimator/run.py noise
 """

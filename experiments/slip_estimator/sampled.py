@@ -1,12 +1,12 @@
-"""How does the slip controller fare on a computer? The question Aoki and Nakamura leave for later.
+"""How does the slip controller fare on a computer?
 
-Their controllers run in continuous time. Here the torque is computed every `period` from the slip at that instant and
-held, and it is applied a computing `delay` later: conventional P and PI control on the identified Magic Formula. Then
-everything at 1 kHz, estimator included.
+The controllers of Aoki and Nakamura run in continuous time. Here a computer samples the slip every `period` and holds
+the torque, which acts a computing `delay` later. Conventional P and PI control run on the identified Magic Formula.
+Then everything runs at 1 kHz, the estimator included.
 
-The loop's gain grows as the car slows down: over one period T the slip changes by g times its error, g = r kp T/(J v).
-With a delay of d periods this is stable for g d < 1 and g (1 - 2 d) < 2, so every sampled loop oscillates below some
-speed. How soon the oscillation is seen depends on rounding errors: distances mean something, peak slips do not.
+The loop's gain grows as the car slows down: over a period T the slip changes by g times its error, g = r kp T/(J v).
+With a delay of d periods the loop is stable for g d < 1 and g (1 - 2 d) < 2. So every sampled loop oscillates below
+some speed. Rounding errors decide how soon the oscillation shows: distances mean something, peak slips do not.
 
     python experiments/slip_estimator/run.py sampled
 """

@@ -1,21 +1,24 @@
-"""What machine would make the paper's claim true? Arm, mount, motor, gear and weights designed together, by gradients.
+"""A machine for the paper's claim: arm, mount, motor, gear and weights, designed together by gradients.
 
-Maximised is the multiple c of the paper's start, frame c 0.5 rad and rider c 0.2 rad, that 48 V recover whoever rides,
-40 to 100 kg. Two ways, one after the other:
+The objective is a multiple c of the paper's start, frame c 0.5 rad and rider c 0.2 rad. It is the largest that 48 V
+recover with every rider of 40 to 100 kg. Three stages follow each other:
 
-    bound      the largest multiple that any control recovers in the linear model, 2 U/sqrt((B'PB)(d'Pd)), maximised
-               over machines for the worst rider: it costs a Riccati equation, and needs no controller
-    rollouts   mean of `SoftLoss` over riders and multiples, through the nonlinear closed loop, the Riccati equation of
-               the LQR and the machine, in the machine and the weights together, from there. The multiples go up to 1.4
-               times what the worst rider recovers, and are drawn again after every stage
-    draws      for a rider of 50 kg alone, from the best machine of the second way: `random_designs.py`, by counting
+- bound: the largest multiple that any control recovers in the linear model, 2 U/sqrt((B'PB)(d'Pd)), is maximised over
+  machines for the worst rider. It costs a Riccati equation and needs no controller.
+- rollouts: the mean of `SoftLoss` over riders and multiples, through the nonlinear closed loop, the Riccati equation of
+  the LQR and the machine. Machine and weights vary together. The multiples go up to 1.4 times that of the worst rider,
+  and are drawn again after every stage.
+- draws: for a rider of 50 kg alone, from the best machine of the second stage (`random_designs.py`).
 
-What the machine may be. The arm is a uniform rod, as in the paper (I2 = m2 s^2/3 about its centre, of half length s),
-and may turn all the way round 0.05 m above the ground; 5 to 40 kg; its centre hangs below the mount by 30 to 50 % of
-its reach (a rod: the paper's is mounted at its end), or by 1 to 3 % (a flywheel that knows where down is). The mount,
-at which the rider sits too, is 0.4 to 1.0 m high. The motor has k = 0.05 to 0.2 N m/A, a rotor of 2e-4 kg m^2, a gear
-of 5 to 400. Its winding decides what power 48 V give: the paper's 3 ohm (192 W at the most), and less, with a current
-of 60 A at the most.
+The ranges of the machine:
+
+- The arm is a uniform rod, as in the paper (I2 = m2 s^2/3 about its centre, of half length s), of 5 to 40 kg. It may
+  turn all the way round 0.05 m above the ground.
+- Its centre hangs below the mount by 30 to 50 % of its reach (a rod; the paper's is mounted at its end), or by 1 to 3
+  % (a flywheel that knows where down is).
+- The mount, at which the rider sits too, is 0.4 to 1.0 m high.
+- The motor has k = 0.05 to 0.2 N m/A, a rotor of 2e-4 kg m^2, and a gear of 5 to 400.
+- The winding decides the power at 48 V: the paper's 3 ohm (at most 192 W), and less, with a current of at most 60 A.
 
     python experiments/two_wheeler/run.py codesign
 """

@@ -1,11 +1,12 @@
-"""What is lost without a sensor of the rider? LQG at 100 Hz from noisy angles of frame and arm, hanging arm, 48 V.
+"""Output feedback without a sensor of the rider: LQG at 100 Hz from noisy angles of frame and arm, hanging arm, 48 V.
 
-A vehicle measures its own lean and its arm, not the rider, and no rates. A steady Kalman filter in the computer that
-runs the controller estimates the rest; it knows the voltage's limit, and begins at the first measured angles with all
-rates and the rider at zero. The start of the paper's Fig. 3, frame 0.5 and rider 0.2 rad, is scaled until the vehicle
-falls for one of many seeds of the noise. Recovered means: it has not fallen after 10 s, and the frame is then within
-`band` of upright, which with noise is all that can be said. A run that has not fallen and is not there is undecided,
-and counted apart.
+A vehicle measures its own lean and its arm, but neither the rider nor rates. A steady Kalman filter estimates the rest
+in the computer of the controller. It knows the voltage limit. It begins at the first measured angles, with all rates
+and the rider at zero.
+
+The start of the paper's Fig. 3, frame 0.5 and rider 0.2 rad, is scaled until the vehicle falls for one of many seeds of
+the noise. A run is recovered if the vehicle stands after 10 s with the frame within `band` of upright. A run that
+stands outside of the band is undecided, and counted apart.
 
     python experiments/two_wheeler/run.py lqg
 """

@@ -1,4 +1,4 @@
-"""What `run.py` designs: arm, mount, motor and gear of a two-wheeler, and the weights of its LQR."""
+"""A machine of the co-design: arm, mount, motor and gear of a two-wheeler, and the weights of its LQR."""
 
 import dataclasses
 

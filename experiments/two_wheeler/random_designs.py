@@ -1,8 +1,9 @@
-"""The last step of a co-design, without gradients: designs drawn around the best, judged by what they recover.
+"""The last step of the co-design, without gradients: random designs around the best one, judged by recovered starts.
 
-What a surrogate is least at is not quite where most is recovered, and the count itself has no gradient. So designs are
-drawn from a normal law around the best one, in coordinates that go from 0 to 1 over each range (in logarithms where a
-range is of positive numbers), and the best of them is the next centre; the law narrows from round to round."""
+The number of recovered starts has no gradient, and a surrogate has its optimum elsewhere. So designs are drawn from a
+normal law around the best one. Coordinates go from 0 to 1 over each range, in logarithms where a range is positive. The
+best design is the next centre, and the law narrows from round to round.
+"""
 
 import dataclasses
 from collections.abc import Callable

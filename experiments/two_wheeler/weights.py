@@ -1,12 +1,13 @@
-"""From how many starts does the hanging arm recover, and do gradients find LQ weights that recover more?
+"""How many starts does the hanging arm recover, and do gradients find LQ weights that recover more?
 
-The region of attraction is a strip, bounded by what 48 V can do about the one unstable mode. Its share of the box
-|theta0|, |phi0| <= 0.1, by area, is a count, which has no derivative; minimised is the mean of `SoftLoss` over starts,
-a sigmoid of log |x(T)|, through the closed loop and through the Riccati equation, in the weights Q = diag(q) and R. The
-count is shown beside it, and the share that some control at 48 V recovers in the linear model (`linear.recoverable`).
+The region of attraction is a strip, bounded by the effect of 48 V on the one unstable mode. Its share of the box
+|theta0|, |phi0| <= 0.1, by area, is a count without a derivative. So gradients minimise the mean of `SoftLoss` over
+starts, a sigmoid of log |x(T)|. It depends on the weights Q = diag(q) and R through the Riccati equation and the closed
+loop. The tables show the count, and the share that some control at 48 V recovers in the linear model
+(`linear.recoverable`).
 
-What comes out is then certified at the linearisation: a common Lyapunov matrix for riders of 40 to 100 kg whose spring
-and damper are off by 30 %.
+A common Lyapunov matrix then certifies the linear loop, for riders of 40 to 100 kg whose spring and damper are off by
+30 %.
 
     python experiments/two_wheeler/run.py weights
 """

@@ -1,10 +1,9 @@
-"""How bad can it get? The worst case of a controller inside a box of plant, road, actuator and speed, and its proof.
+"""The worst case of a controller in a box of plant, road, actuator and speed, and a certificate over the box.
 
-Gradient ascent from the worst of the box's corners and of a few random points, against 100,000 random samples of the
-same box, and against its 32 corners alone: where the worst is a corner, gradients are not what found it. It is one
-for the cure. Asked of the published gain and of the cured controller (scenario slip-cured) on the rig with torque
-limits, lag and a sampled controller. A counterexample needs no proof; its absence does, so the same box is handed to
-`certify`, which speaks about the linear loop.
+Gradient ascent starts from the worst corner and from the worst of a few random points. It is compared with 100,000
+random samples and with the 32 corners alone. The controllers are the published gain and the cured one (scenario
+slip-cured), on the rig with torque limits, lag and sampling. A counterexample needs no proof, but its absence does. So
+`certify` gets the linear loop over the same box.
 
     python experiments/worst_case/run.py
 """
