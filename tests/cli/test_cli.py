@@ -242,6 +242,7 @@ def test_plot_without_matplotlib(tmp_path, monkeypatch):
     assert 'pip install ".[plot]" in a clone' in result.stderr
 
 
+@pytest.mark.slow
 def test_real_figure(tmp_path, simulated):
     pytest.importorskip("matplotlib")
     run("simulate", "slip-lmi", "--plot", tmp_path / "a.png")
@@ -354,6 +355,7 @@ def test_quiet_says_results_and_warnings_only(monkeypatch):
     assert "checking the scenario" in run("simulate", "slip-lmi", *SHORT).stderr  # the next one is loud again
 
 
+@pytest.mark.slow
 def test_show_prints_a_scenario_to_start_from(tmp_path):
     """What is printed is the same scenario, so its run is the same to the last bit."""
     text = run("show", "slip-lmi", "--set", "plant.mass=6.2", *SHORT).stdout

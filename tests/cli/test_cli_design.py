@@ -145,6 +145,7 @@ def test_certificate_is_proved_by_who_shares_nothing(designed, tmp_path):
     assert Certificate.load(folder / "c.json").gain.ravel().tolist() == document["gain"]
 
 
+@pytest.mark.slow
 def test_changes_reach_the_design():
     changes = ("--set", "design.Q=1e6,1e4", "--set", "design.over.plant.mass=5.3,5.3")
     document = json.loads(run("design", "slip-lmi", "--json", *changes).stdout)
@@ -334,6 +335,7 @@ def test_threshold_of_quadratic_stability(gain, proved):
     assert document["quadratically_stable"] is proved
 
 
+@pytest.mark.slow
 def test_where_two_vertices_refute_at_once(tmp_path):
     """The solver's best P is 0 with a margin of +1e-14; the product of two closed loops has a negative eigenvalue."""
     ranges = ("design.over.plant.mass=[5.11,5.87]", "design.over.initial.speed_kmh=[3.9,50.4]")

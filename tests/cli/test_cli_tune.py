@@ -195,6 +195,7 @@ def test_figure_and_file_and_nothing_else_are_left(tuned):
 # What is asked
 
 
+@pytest.mark.slow
 def test_the_section_reaches_the_tuning(small, invented):
     changes = ("tune.aggregate=cvar", "tune.aggregate.level=0.75", "tune.seed=7", "tune.limits.iae=0.5")
     sets = [word for change in changes for word in ("--set", change)]

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import run
+from decaying import decay_loop
 from kernels import FOLDER
 from mutants import killed_by
 from seams import replace_seam
@@ -115,7 +116,7 @@ class TestDefault:
         """With no warning, since a kernel makes none."""
         log_own_choice.cache_clear()
         with caplog.at_level(logging.INFO, "diffabs"):
-            d.run_batch(LOOP, TUNED["over"], d.FixedStep(5e-3, 0.05, every=10), trajectories=True)
+            d.run_batch(decay_loop(), d.Batch({"plant.rate": [1.0, 2.0]}), d.FixedStep(0.1, 0.2), trajectories=True)
         assert [record.levelname for record in caplog.records] == ["INFO"]
 
     @killed_by("tune/tuning.py", 'engine: str = "auto",', 'engine: str = "xla",')
@@ -287,6 +288,7 @@ def test_a_map_of_starts_is_that_of_xla():
 
 
 class TestSweep:
+    @pytest.mark.slow
     def test_a_library_that_cannot_be_written_is_said(self, monkeypatch, tmp_path):
         """As on a full disk: it is compiled after everything was traced."""
         (tmp_path / "file").touch()

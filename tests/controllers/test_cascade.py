@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 import scipy.integrate
+from marks import cases
 from mutants import killed_by
 from project import ROOT
 
@@ -59,10 +60,19 @@ def solved(rates, states):
     ]
 
 
+FURTHER = [((1.0, 1.0), 1.0), ((1.0, 1.0), -1.0), ((0.3, 0.0), -1.0), ((0.0, 0.6), 1.0)]
+
+
 @killed_by("controllers/pid.py", "self.kp * (self.b * signal.target", "self.kp * (signal.target")
 @killed_by("controllers/pid.py", "self.cutoff * (self.c * signal.target", "self.cutoff * (signal.target")
-@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["direct", "reverse"])
-@pytest.mark.parametrize(("b", "c"), [(1.0, 1.0), (0.3, 0.0), (0.0, 0.6)])
+@pytest.mark.parametrize(
+    ("b", "c", "sign"),
+    [
+        (0.3, 0.0, 1.0),
+        (0.0, 0.6, -1.0),
+        *[pytest.param(*weights, sign, marks=pytest.mark.slow) for weights, sign in FURTHER],
+    ],
+)
 def test_weights_and_reverse_action(servo, sign, b, c):
     """Of a motor whose amplifier has this sign, and gains with the same sign."""
 
@@ -99,7 +109,7 @@ def cascade(**options):
     "zip(memory.flow, memory.held, strict=True)",
     "zip(memory.flow[::-1], memory.held, strict=True)",
 )
-@pytest.mark.parametrize("name", ["", "speed"])
+@pytest.mark.parametrize("name", cases(["speed", ""], ""))
 def test_a_cascade_with_limits_and_anti_windup_of_each(servo, name):
     found, command = last(closed_loop(servo, cascade(inner_signal=name)))
     hit = {"outer": False, "inner": False}
@@ -157,6 +167,7 @@ def test_what_a_cascade_refuses(servo):
     assert "controller.inner_signal = sped is no output of the plant; there is angle, speed, current" in line
 
 
+@pytest.mark.slow
 def test_a_sampled_cascade(servo):
     """It follows the continuous one the closer the shorter the period; its rules name the inner parts."""
     command = [last(closed_loop(servo, Sampled(controller=cascade(), period=T)))[0][0] for T in (2e-3, 5e-4, 1e-4)]

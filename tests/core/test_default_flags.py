@@ -51,12 +51,16 @@ def exact_slopes():
 @killed_by("simulate/solve.py", "@default_flags()\ndef solve(", "def solve(")
 def test_fields(strict):
     rows = np.asarray(position(RATE))
+    np.testing.assert_allclose(rows[:, 0], np.cos(np.asarray(RATE) * np.asarray(TIMES)), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_many_fields(strict):
     many = np.asarray(jax.jit(jax.vmap(position))(RATES))
-    phase = np.outer(RATES, TIMES)
-    np.testing.assert_allclose(rows[:, 0], np.cos(phase[1]), atol=1e-6)
-    np.testing.assert_allclose(many[:, :, 0], np.cos(phase), atol=1e-6)
+    np.testing.assert_allclose(many[:, :, 0], np.cos(np.outer(RATES, TIMES)), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_of_fields(strict):
     slopes = jax.jit(jax.vmap(jax.jacfwd(lambda rate: position(rate, d.FixedStep(0.02)))))(RATES)
     np.testing.assert_allclose(np.asarray(slopes)[:, :, 0], exact_slopes(), atol=1e-5)

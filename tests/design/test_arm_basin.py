@@ -394,6 +394,7 @@ def test_angles_alone_may_have_a_weight():
         assert found.certificate.verified_exactly
 
 
+@pytest.mark.slow
 def test_the_gain_for_one_rider_is_disproved():
     system = grid_polytope(BalanceModel(plant=HANGING), OVER)
     proof = certify(GAIN, system)

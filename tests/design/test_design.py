@@ -785,6 +785,7 @@ def test_unknowns_pack_and_unpack():
     np.testing.assert_allclose(block.h[0] + np.einsum("d,dij->ij", y, block.G[0]), a @ v["X"] + v["X"] @ a.T - 1)
 
 
+@pytest.mark.slow
 def test_importing_loads_no_solver():
     heavy = "{'cvxpy', 'clarabel', 'scipy.optimize', 'matplotlib'}"
     program = f"import sys, diffabs, diffabs.design; sys.exit(bool({heavy} & set(sys.modules)))"

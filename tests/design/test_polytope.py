@@ -49,6 +49,7 @@ def furthest(model, over, vertices, count=40):
     return max(distance(s, vertices) for s in zip(*map(np.asarray, systems), strict=True))
 
 
+@pytest.mark.slow
 def test_paper():
     """Four vertices, each a pair: alpha(m)/omega with the beta/omega of the same omega. Eq. (22) leaves that open."""
     p = polytope(SlipModel(), PAPER)

@@ -93,6 +93,7 @@ def test_the_readme_has_two_pages():
     assert sum(-(-len(line) // 100) for line in TEXT.splitlines()) < 150
 
 
+@pytest.mark.slow
 def test_the_readme_prints_its_table(capsys):
     exec(compile(START.replace("4096", "3"), "README.md", "exec"), {})
     rows = capsys.readouterr().out.splitlines()

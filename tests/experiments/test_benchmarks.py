@@ -50,6 +50,7 @@ def test_the_error_is_the_worst_run_and_nan_is_worse():
     np.testing.assert_allclose(errors(found, right), [0.1, 0.1, np.inf, 0.0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_scipy_gives_the_published_run():
     found = module("peers.reference").by_scipy(5.3, 50 / 3.6)
     np.testing.assert_allclose(found, [1.615305, 12.370507, 0.363764, 0.02296340], rtol=1e-6)  # docs/results.md
@@ -73,6 +74,7 @@ def test_c_agrees_with_scipy(dtype):
         assert module("peers.problem").errors(c.solved("adaptive", *LANES, 1e-9)[0], right).max() < worst.max() / 10
 
 
+@pytest.mark.slow
 def test_a_loop_without_a_jit_agrees_with_the_reference():
     reference, loop = module("peers.reference"), module("peers.scipy_loop")
     found = loop.prepared(LANES[0][:2], LANES[1][:2], 1e-8, "float64", 1)()

@@ -526,14 +526,17 @@ def test_a_tuning_names_the_bounds_at_which_it_ended(file):
 @killed_by("explore/tuning.py", "if loop.corners.unstable:", "if False:")
 def test_unstable_corners_are_named(file):
     """By the poles of the closed loops; a positive gain drives the slip away."""
-    session = Session(str(file(SHORT)))
-    now = session.scenario()
-    assert tuning.describe_instability(now) == ""
+    now = Session(str(file(SHORT))).scenario()
     lost = dataclasses.replace(now, loop=replace(now.loop, {"controller.gain": (11753.0, 48.0)}))
     assert tuning.describe_instability(lost) == (
         "the loop is not stable; 4 of 4 corners of [design.over] are not stable"
     )
     assert all(np.any(closed_loop_poles(open_loop(loop).transfer()).real > 0) for loop in (lost.loop,))
+
+
+@pytest.mark.slow
+def test_nothing_is_said_of_stable_corners(file):
+    assert tuning.describe_instability(Session(str(file(SHORT))).scenario()) == ""
 
 
 @killed_by("explore/tuning.py", "{knob.words(high)}", "{knob.text(high)} {knob.spec.unit}")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from marks import cases
 from mutants import killed_by
 from scipy.signal import cont2discrete
 
@@ -111,6 +112,7 @@ def test_linearize_against_differences(plant):
 
 
 @pytest.mark.parametrize("brake", [1.0, 4.0])
+@pytest.mark.slow
 def test_tracking_away_from_equilibrium(brake):
     """The lab rig, its brake anywhere: rates of slip and brake by finite differences in those coordinates, at a fixed
     drum speed, from the derivative of slip = 1 - r1 w1/(r2 w2) by the quotient rule."""
@@ -422,7 +424,7 @@ def one_period(loop, z, period):
     return jnp.stack([own[0], state.plant, state.actuator.flow, held.next, *own[1:]])
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.002])
+@pytest.mark.parametrize("delay", cases([0.0, 0.002], 0.0))
 @pytest.mark.parametrize(
     "controller",
     [
@@ -473,7 +475,11 @@ CONTROLLERS = {
 }
 
 
-CASES = [("rig", name, Direct()) for name in CONTROLLERS] + [("rig", "pid", RateLimit()), ("car", "pid", Lag())]
+CASES = [
+    *[("rig", "proportional", Direct()), ("car", "pid", Lag())],
+    pytest.param("rig", "pid", RateLimit(), marks=pytest.mark.slow),
+    *[pytest.param("rig", x, Direct(), marks=pytest.mark.slow) for x in CONTROLLERS if x != "proportional"],
+]
 
 
 @killed_by(

@@ -259,6 +259,7 @@ def test_single_precision_is_refused(solve):
         jax.vmap(lambda q: solve(jnp.asarray(a), b, q, one))(jnp.stack([one, one]))
 
 
+@pytest.mark.slow
 def test_the_filter_of_numbers_in_lists():
     """x(k+1) = x(k) + w, y = x + v, all variances 1: P is the golden number, as of the regulator."""
     found = kalman([[1.0]], [[1.0]], [[1.0]], [[1.0]])
@@ -303,6 +304,7 @@ def test_traced_weights_count_by_their_symmetric_part(name):
 
 
 @pytest.mark.parametrize("name", cases(GAINS, "dlqr", "kalman"))
+@pytest.mark.slow
 def test_traced_weights_count_by_their_symmetric_part_in_the_derivative(name):
     """By a single entry of R."""
     a, b, q, r = skewed_problem()
@@ -384,6 +386,7 @@ def test_gradients_are_differences(solver):
         np.testing.assert_allclose(np.sum(np.asarray(back) * direction), difference, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_rigs_gain_in_its_weights():
     """k1 = -sqrt(q1/R): its derivative in log q1 is k1/2."""
     a, b = rig()
@@ -541,6 +544,7 @@ HYDRAULIC = (  # a cylinder: position [m], speed [m/s], pressure [Pa]; the input
 )
 
 
+@pytest.mark.slow
 def test_a_cylinder_in_pascal_has_a_regulator():
     a, b = HYDRAULIC
     q, r = np.diag([1.0, 0.0, 0.0]), np.array([[1e6]])

@@ -144,6 +144,7 @@ def test_the_derivative_of_an_overshoot(first, value):
         assert np.isfinite(slopes["iae"])
 
 
+@pytest.mark.slow
 def test_the_step_of_a_filtered_target_is_the_one_to_its_end():
     """Target r + (y0 - r) exp(-5 t) from y0: the linear response is computed here by a matrix exponential."""
     first, value = 3.0, 1.0

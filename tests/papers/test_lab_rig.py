@@ -57,6 +57,7 @@ def test_coasting_gives_the_bearings_of_table_4():
         np.testing.assert_allclose(values, printed, rtol=0.04)
 
 
+@pytest.mark.slow
 def test_the_tables_of_the_manual_are_those_of_the_mask():
     """And not of the rig that braked: its brake is 2.8 times as strong, its friction with the same load about half."""
     with jax.enable_x64(True):

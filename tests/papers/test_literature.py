@@ -72,6 +72,7 @@ def test_bounds_are_those_of_the_ordinary_differential_equation(c):
         ("literature-pedro", "distance", 46.492),
     ],
 )
+@pytest.mark.slow
 def test_bounds_of_an_independent_program(scenario, kind, bound):
     with jax.enable_x64(True):
         row = {"bound": kind}
@@ -158,6 +159,7 @@ def stop_of_band_logic(torque):
     return np.inf
 
 
+@pytest.mark.slow
 def test_the_combined_logic_on_the_wet_road_is_on_a_knife_edge():
     """The printed 3.512 s is that of 798 N m within 1 %, and not that of 800."""
     row = committed_row("pagawali", "stop time, combined logic, wet road")

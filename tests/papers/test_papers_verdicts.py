@@ -110,6 +110,7 @@ def test_friction_at_low_speed(runs):
     assert slow / whole == pytest.approx(0.08, abs=0.005)
 
 
+@pytest.mark.slow
 def test_the_identified_curve_peaks_at_half_the_usual_slip():
     """ "Near 0.2 in general": 0.105 on the curve that gives its tables, and on the other one."""
     found = {name: float(jax.jit(peak)(car.road).slip) for name, car in slip_estimator.CARS.items()}

@@ -29,6 +29,7 @@ def lines(ax):
     return {line.get_label(): np.array(line.get_data(), float) for line in ax.get_lines()}
 
 
+@pytest.mark.slow
 def test_history_is_over_the_gradients_computed(tmp_path):
     figure = plots.draw_tuning(HISTORY, RUNS)
     objective, gradient, _, _, violation = figure.axes

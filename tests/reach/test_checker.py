@@ -492,6 +492,7 @@ def test_a_wide_parameter_of_the_flow_is_enclosed():
     assert 8.0 <= bounds.upper["x"] <= 18.0
 
 
+@pytest.mark.slow
 def test_an_end_with_different_rates_is_enclosed():
     """x' = x^2 ends at x = 2: while the runs pass the end one after another, the rates change."""
     t = Tape()

@@ -114,6 +114,7 @@ def rig_run(mass: float, speed: float, high: float = 9.03) -> tuple[float, float
     return float(np.max(1 - r1 * found.y[0] / (r2 * found.y[1]))), float(found.t[-1]), float(found.y[3, -1])
 
 
+@pytest.mark.slow
 def test_published_gain_within_its_limits() -> None:
     proof = prove_box(
         load("slip-lmi", LIMITED).loop,
@@ -160,6 +161,7 @@ def test_a_distance_that_is_a_signal_has_its_bounds() -> None:
 @pytest.mark.parametrize(
     "quantity", cases(["greatest slip", "stop_time", "stop_distance"], "stop_time", "stop_distance")
 )
+@pytest.mark.slow
 def test_false_claims_are_refuted(quantity: str) -> None:
     column = ("greatest slip", "stop_time", "stop_distance").index(quantity)
     corners = [(m, v) for m in SMALL["plant.mass"] for v in SMALL["initial.speed"]]
@@ -191,6 +193,7 @@ def test_no_false_claim_of_a_hundred_is_proved() -> None:
         assert prove_box(loop, box, [claim], signals=("slip",), horizon=2.0, budget=prove_time).verdict != "proved"
 
 
+@pytest.mark.slow
 def test_without_time_nothing_is_decided() -> None:
     proof = prove_box(
         load("slip-lmi", LIMITED).loop, SMALL, [RunClaim("greatest slip", 0.34)], horizon=2.0, budget=1e-9

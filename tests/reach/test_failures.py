@@ -19,6 +19,7 @@ def test_a_slip_that_becomes_negative_is_named() -> None:
     assert proof.failure == "even one run is not proved: the slip may become negative"
 
 
+@pytest.mark.slow
 def test_a_cell_that_is_too_wide_is_named() -> None:
     limits = ["controller.low=0", "controller.high=9.03"]
     prover = Prover(derive_equations(load("slip-lmi", limits).loop, ["plant.mass", "initial.speed"]), ("slip",), 2.0)

@@ -130,6 +130,7 @@ class TestKnown:
 
 
 class TestSubset:
+    @pytest.mark.slow
     def test_the_estimate_is_unbiased_and_its_intervals_cover(self):
         # a bias of 1 to 2 % is expected at 2800 samples; the interval covers 95 % (measured: 94 to 96 %)
         truth = parabola_probability(0.05, 10, B6)

@@ -33,6 +33,7 @@ def test_the_root_loads_no_extra():
 
 
 @pytest.mark.parametrize("first", cases(["import diffabs.tune, diffabs.sweep", "d.tune, d.sweep"], "d.tune, d.sweep"))
+@pytest.mark.slow
 def test_packages_are_the_same_whatever_comes_first(first):
     program = f"""
 import sys, diffabs as d

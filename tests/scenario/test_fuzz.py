@@ -18,6 +18,7 @@ def test_random_scenarios_are_refused_in_a_line_or_run():
     assert tally.counts["ran"] + tally.counts["diverged"] == tally.counts["accepted"]
 
 
+@pytest.mark.slow
 def test_the_same_seed_makes_the_same_scenarios():
     made = []
     for _ in range(2):

@@ -44,7 +44,7 @@ SHORT, NEVER, AT_ONCE, DIVERGING = 1, 2, 4, 7
 GAINS = np.where(np.arange(len(SPEEDS)) == DIVERGING, 1e308, -40.0)
 VALUES = {"initial.speed": SPEEDS, "controller.gain.1": GAINS}
 SOME = 4  # lanes on the belt where it does not matter how many
-WIDTHS = [1, SOME, pytest.param(len(SPEEDS) + 5, marks=pytest.mark.slow)]
+WIDTHS = [1, SOME, len(SPEEDS) + 5]
 
 QUIET = replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
 
@@ -100,7 +100,8 @@ class TestLanes:
         assert np.isnan(expected.metrics["iae"]).tolist() == expected.diverged.tolist()
         assert len(np.unique(expected.metrics["iae"][[SHORT, 6]])) == 2  # noise of their own, everything else is equal
 
-    @pytest.mark.parametrize("width", cases(WIDTHS, 4))
+    @pytest.mark.slow
+    @pytest.mark.parametrize("width", WIDTHS)
     def test_are_those_of_single_runs(self, width, keys, expected, monkeypatch):
         """Of whom enough is never seen: no car is slower than 0."""
         replace_seam(monkeypatch, "lanes_at_once", width)
@@ -215,12 +216,40 @@ class TestLanes:
         assert packed._run._cache_size() == before
 
 
+class Far(NamedTuple):
+    """A lane is over beyond its own place [m]."""
+
+    places: Any
+
+    def data_of(self, number):
+        return number
+
+    def has_reached(self, number, output):
+        return output.x > self.places[jnp.minimum(number, len(self.places) - 1)]
+
+
 @killed_by(
     "simulate/drive/packed.py",
     "free = ~slots.carry.running | _lanes_ended_early(enough, build_lane, slots, numbers)",
     "free = ~slots.carry.running",
 )
-@pytest.mark.parametrize("width", cases(WIDTHS, 4))
+def test_lanes_make_room_for_others(monkeypatch):
+    """The integral of x = (1 - exp(-rate t))/rate; the second lane is over beyond 0.2 m, at the next look."""
+    replace_seam(monkeypatch, "lanes_at_once", 2)
+    end, rates, places = 0.03 * STEPS_PER_EXCHANGE, np.linspace(0.5, 2.0, 5), np.array([9.0, 0.2, 9.0, 9.0, 9.0])
+    batch, solver = Batch({"plant.rate": rates}), d.FixedStep(0.01, end)
+    run = d.run_batch(decay_loop(), batch, solver, {"iae": IAE()}, accepted=True, enough=Far(jnp.asarray(places)))
+    over = places < 9.0
+    np.testing.assert_allclose(
+        run.metrics["iae"][~over], ((end - (1 - np.exp(-rates * end)) / rates) / rates)[~over], rtol=1e-9
+    )
+    np.testing.assert_array_equal(run.timed_out, ~over)
+    taken = run.ending.sample.t[over] / end * 3
+    np.testing.assert_allclose(taken, np.ceil(-np.log(1 - 0.2 * rates[over]) / rates[over] / end * 3), rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", WIDTHS)
 def test_a_lane_of_which_enough_is_seen_is_taken_off(keys, expected, width, monkeypatch):
     """At the next look; it has not stopped, and the others are what they were."""
     replace_seam(monkeypatch, "lanes_at_once", width)
@@ -362,18 +391,18 @@ def test_a_loop_that_no_run_may_have_is_named_without_values(batch):
 
 
 @killed_by("simulate/batch.py", "jnp.asarray(column, dtype)", "jnp.asarray(column, float)")
-def test_results_have_the_precision_of_the_loop():
+@pytest.mark.parametrize("together", cases([True, False], False))
+def test_results_have_the_precision_of_the_loop(together):
     loop, batch = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), decay_loop()), Batch({"plant.rate": [1.0, 2.0]})
-    for together in (True, False):
-        run = d.run_batch(loop, batch, d.FixedStep(0.1, 1.0), {"iae": IAE()}, together=together, engine="xla")
-        assert {column.dtype for column in run.metrics.values()} == {np.dtype(np.float32)}, together
+    run = d.run_batch(loop, batch, d.FixedStep(0.1, 1.0), {"iae": IAE()}, together=together, engine="xla")
+    assert {column.dtype for column in run.metrics.values()} == {np.dtype(np.float32)}
 
 
 @killed_by("simulate/batch.py", "(count, *jnp.shape(x))", "(1, *jnp.shape(x))")
 @pytest.mark.parametrize("column", ["weights", "durations"])
 def test_a_batch_without_values_has_one_result_for_each_run(column):
     batch = Batch(**{column: [0.5, 0.5, 0.1]})
-    run = d.run_batch(QUIET, batch, SOLVER, MEASURED)
+    run = d.run_batch(decay_loop(), batch, d.FixedStep(0.1, 1.0), {"iae": IAE()})
     assert batch.size == 3
     assert {np.shape(x) for x in jax.tree.leaves((run.metrics, run.stopped, run.diverged, run.timed_out))} == {(3,)}
 

@@ -351,6 +351,7 @@ def test_a_sweep_of_before_has_no_units(swept):
     assert older.pandas().attrs["units"] == {}
 
 
+@pytest.mark.slow
 def test_no_table_of_the_command_line_has_rounding_for_a_number(monkeypatch):
     from diffabs.cli import show
 

@@ -48,6 +48,7 @@ def test_order_four_on_the_smooth_loop():
 
 
 @pytest.mark.parametrize("step", [1e-3, 0.7e-3])
+@pytest.mark.slow
 def test_standstill_of_a_locked_wheel_in_closed_form(step):
     run = d.measure(SLIDING, d.FixedStep(step, 2.0), BRAKING)
     assert run.stopped
@@ -245,7 +246,8 @@ def test_a_diverging_run_changes_no_other_run():
     many = jax.vmap(run)(gains)
     np.testing.assert_array_equal(many.diverged, [False, True, False])
     assert np.isnan(many.metrics["iae"][1])
-    np.testing.assert_allclose(many.metrics["iae"][0], run(gains[0]).metrics["iae"], rtol=1e-12)
+    alone = jax.vmap(run)(gains.at[1].set(gains[0]))
+    np.testing.assert_array_equal(many.metrics["iae"][0], alone.metrics["iae"][0])
 
 
 @pytest.mark.slow

@@ -153,6 +153,7 @@ class TestFirstOrder:
             jax.jit(outer(inner(cube)))(2.0)
 
 
+@pytest.mark.slow
 def test_the_certified_decay_has_first_derivatives_only():
     A, B = jnp.array([[[0.0, 1.0], [0.0, 0.0]]]), jnp.array([[[0.0], [1.0]]])
 

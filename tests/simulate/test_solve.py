@@ -395,6 +395,7 @@ def test_integers_in_args_and_many_states():
     np.testing.assert_allclose(found.y, np.full((10, 5), np.exp(-2)), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_field_of_diffrax_goes_in():
     diffrax = pytest.importorskip("diffrax", reason="the group `bench` brings it")
     assert field_of(diffrax.ODETerm(fall)) is fall

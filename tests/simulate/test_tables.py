@@ -80,6 +80,7 @@ def test_the_first_table_of_a_process_may_be_made_anywhere(order):
     np.testing.assert_allclose([float(line) for line in done.stdout.split()], AREA, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_proof_refuses_a_search_in_a_table():
     """A run that crosses a knot decides the place differently from its neighbours, so the line says what to write."""
     loop = d.braking(controller=Table())

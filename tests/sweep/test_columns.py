@@ -62,6 +62,7 @@ def test_another_file_is_another_sweep(scenario, tmp_path):
     assert Results(out).digest == digest
 
 
+@pytest.mark.slow
 def test_it_may_be_set_on_the_command_line_and_interpolated(scenario):
     change = 'sweep.over.plant.mass={type="empirical", file="day/masses.csv", column="mass [kg]", interpolated=true}'
     chosen = section_sweep.build_study(load(scenario, [change]))

@@ -392,6 +392,7 @@ def test_every_device_is_used(study, monkeypatch):
 # How it is opened
 
 
+@pytest.mark.slow
 def test_pandas_polars_and_xarray_in_one_call_each(made):
     mass = made.column("plant.mass")
     frame, table, data = made.pandas(), made.polars(), made.xarray()

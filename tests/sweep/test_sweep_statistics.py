@@ -580,6 +580,7 @@ class TestCoverage:
         )
         assert abs(found - 95) < 2
 
+    @pytest.mark.slow
     def test_cvar_of_zeros_and_ones_at_its_kink(self):
         """P(1) = 0.045 against a tail of 0.05: one sample in five has only ones in its tail, and none is sure of it."""
         random = np.random.default_rng(39)

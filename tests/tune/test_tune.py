@@ -399,6 +399,7 @@ class TestConstraints:
         assert not found.met
         assert found.violation[1] > 0.9
 
+    @pytest.mark.slow
     def test_the_best_of_many_starts_meets_them(self):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1]]))
         told = []

@@ -462,6 +462,7 @@ class TestWeights:
 class TestSpeedScaled:
     MODEL = SlipModel(actuator=actuators.Lag(time_constant=1e-3), sampling=Sampling(period=1e-3))
 
+    @pytest.mark.slow
     def test_at_a_frozen_speed_it_is_the_same_loop(self):
         """w = K z is u = (v/v0) K x, so closed loops are similar: the same poles."""
         gain, v = np.array([[-8000.0, -200.0, 0.1, -0.2]]), 4.0
