@@ -81,7 +81,7 @@ class DeadTime:
         changed = signal != m.newest
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(changed, a, b), sent, m))
 
-    def margins(self, t: Scalar, memory: Memory, signal: Scalar, rate: PyTree) -> tuple[PyTree]:
+    def margins(self, t: Scalar, memory: Memory, signal: Scalar, rate: object) -> tuple[PyTree]:
         """Return the time until the next switch arrives [s], or 1 s if no switch is on its way."""
         del signal, rate
         due = memory.held.due[0]

@@ -29,7 +29,7 @@ from diffabs.core.log import Log
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import param, pytree, static
 from diffabs.core.rules import Rule
-from diffabs.core.types import Int, Matrix, PyTree, Scalar, Vector
+from diffabs.core.types import Any, Array, Int, Matrix, PyTree, Scalar, Vector
 
 TIME_ROUNDING = 1e-6  # relative rounding of single precision
 WINDOW_PIECES = 6  # pieces; a step that spans more is cut
@@ -83,12 +83,12 @@ class DelayMemory(NamedTuple):
 
     ring: Log
     window: Matrix
-    valid: Int
-    place: Scalar
-    last: PyTree
+    valid: Array
+    place: Array
+    last: Array
     until: Scalar
-    first: Int
-    count: Scalar
+    first: Array
+    count: Array  # pyright: ignore[reportIncompatibleMethodOverride]  # not that of a tuple
     newest: Int
 
 
@@ -128,7 +128,7 @@ class Delay:
         within = _at_most_one(x)
         return piece.command(within) + (x - within) * piece.command.end_slope
 
-    def margins(self, t: Scalar, memory: Memory, signal: Scalar, rate: PyTree) -> tuple[PyTree]:
+    def margins(self, t: Scalar, memory: Memory, signal: Scalar, rate: object) -> tuple[PyTree]:
         """Return the time [s] until the next break leaves the delay, or until the window runs out of pieces."""
         del signal, rate
         return (memory.held.until + self.time - t,)
@@ -172,7 +172,7 @@ class Delay:
         new = self._aim_at_break(DelayMemory(m.ring, window, valid, none, none, none, first, count, m.newest))
         return memory._replace(held=self._at_once(new, clock.t))
 
-    def _at_once(self, m: DelayMemory, t: Scalar) -> DelayMemory:
+    def _at_once(self, m: DelayMemory, t: Any) -> DelayMemory:
         """Return the memory after the breaks that leave the delay at time t or earlier."""
         out = (m.last + 1 < m.valid) & (m.until + self.time <= t)
         return self._aim_at_break(m._replace(place=jnp.where(out, m.last + 1, m.place)))
@@ -184,7 +184,7 @@ class Delay:
         """
         return _InEvents(time=self.time, capacity=self.capacity) if "time" in names else self
 
-    def _place(self, t: Scalar, m: DelayMemory) -> PyTree:
+    def _place(self, t: Any, m: DelayMemory) -> Array:
         """Return the window index of the piece that leaves at time t, limited to the pieces before the next break."""
         return _count([m.window[i, 1] for i in range(WINDOW_PIECES)], t - self.time, m.place, m.last)
 
@@ -226,7 +226,7 @@ class _InEvents(Delay):
     The event time then has a derivative. The sample stored at that instant is the command before the break.
     """
 
-    def _at_once(self, m: DelayMemory, t: Scalar) -> DelayMemory:
+    def _at_once(self, m: DelayMemory, t: Any) -> DelayMemory:
         # Breaks more than a few roundings in the past have left already: when the solver repeats a step, rounding may
         # reveal a break that the first try did not see.
         m = Delay._at_once(self, m, t - 4 * _time_tolerance(t))
@@ -246,7 +246,7 @@ def _row(piece: Piece) -> Vector:
     return jnp.stack([jnp.asarray(x) for x in jax.tree.leaves(piece)])
 
 
-def _piece(window: Matrix, place: Scalar) -> Piece:
+def _piece(window: Matrix, place: Array) -> Piece:
     """Return the piece at a place of the window, by selects.
 
     A gather at a computed index would prevent XLA from fusing the stages of a step.
@@ -258,7 +258,7 @@ def _piece(window: Matrix, place: Scalar) -> Piece:
     return Piece.of(row)
 
 
-def _ring_place(place: Scalar, size: int) -> Scalar:
+def _ring_place(place: Array, size: int) -> Array:
     """Return a place wrapped into a ring of `size` rows, for place < 2 size."""
     return jnp.where(place >= size, place - size, place)
 
@@ -273,7 +273,7 @@ def _differ(before: tuple[PyTree, PyTree], after: tuple[PyTree, PyTree]) -> Scal
     return jnp.any(jnp.stack(jumps))
 
 
-def _time_tolerance(t: Scalar) -> Scalar:
+def _time_tolerance(t: Any) -> Any:
     """Return the bound on the difference of two computations of the time t [s]."""
     return TIME_EPS * jnp.finfo(jnp.result_type(t)).eps * jax.lax.stop_gradient(t)
 
@@ -283,7 +283,7 @@ def _time_tolerance(t: Scalar) -> Scalar:
 
 
 @jax.custom_jvp
-def _count(ends: list[PyTree], t: Scalar, low: Scalar, high: Scalar) -> Scalar:
+def _count(ends: list[PyTree], t: Array, low: Scalar, high: Scalar) -> Array:
     """Return the number of pieces that are over at time t, clamped to [low, high]."""
     over = sum(jnp.where((i < high) & (t >= end), 1.0, 0.0) for i, end in enumerate(ends))
     return jnp.maximum(jnp.minimum(jnp.asarray(over, t.dtype), high), low)

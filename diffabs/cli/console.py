@@ -19,7 +19,7 @@ from rich.console import Console
 
 from diffabs.cli import progress
 from diffabs.config.values import ScenarioError
-from diffabs.core.types import Int, JsonObject
+from diffabs.core.types import JsonObject
 from diffabs.roads.sign import find_wrong_sign
 from diffabs.runtime import files, interrupt, provenance, stopwatch
 from diffabs.scenario import outside
@@ -344,7 +344,7 @@ def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: b
     return setup
 
 
-def leave(status: Int) -> NoReturn:
+def leave(status: str | int | None) -> NoReturn:
     """End the process with an exit status, without waiting for interrupted work.
 
     The interpreter would wait for the thread of such work. This function ends the process at once, after it has removed

@@ -14,7 +14,6 @@ from diffabs import __version__
 from diffabs.cli import console, show, tables, targets
 from diffabs.config.values import ScenarioError
 from diffabs.controllers import Sampled, SampledOnGrid
-from diffabs.core.types import PyTree
 from diffabs.runtime.provenance import versions
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.types import FixedStep
@@ -117,7 +116,7 @@ def _function_prefix(scenario: Scenario, out: pathlib.Path | None) -> str:
     return name if name[:1].isalpha() else f"controller_{name}".rstrip("_")
 
 
-def _write_source(scenario: Scenario, out: pathlib.Path | None, to: Form, single: bool, extra_input: PyTree) -> str:
+def _write_source(scenario: Scenario, out: pathlib.Path | None, to: Form, single: bool, extra_input: object) -> str:
     from diffabs.export import c_source, computer_program, structured_text
 
     step = getattr(scenario.solver, "step", None)

@@ -43,7 +43,7 @@ from diffabs.cli import (
 from diffabs.config.values import ScenarioError
 from diffabs.core import jax_flags
 from diffabs.core.pytree import parameters
-from diffabs.core.types import JsonObject, Key, Scalar
+from diffabs.core.types import JsonObject, Key
 from diffabs.objectives import at_limits
 from diffabs.runtime import compilation_cache, interrupt, provenance
 from diffabs.scenario import model
@@ -79,11 +79,11 @@ def main() -> NoReturn:
     interrupt.begin_hearing()
     try:
         app()
-        status: Scalar = 0
-    except SystemExit as leave:
-        status = leave.code
+        ending = SystemExit(0)
+    except SystemExit as error:
+        ending = error
     interrupt.stop_hearing()
-    console.leave(status)
+    console.leave(ending.code)
 
 
 def _version(requested: bool) -> None:

@@ -16,7 +16,7 @@ from diffabs.cli.console import say
 from diffabs.cli.tables import open_console, show_titled_table
 from diffabs.core.bijectors import reached_bound
 from diffabs.core.summary import format_metric, round_for_table
-from diffabs.core.types import JsonObject, Params, Part, Scalar
+from diffabs.core.types import JsonObject, Params, Part
 from diffabs.papers.digest import Digest
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
@@ -35,12 +35,12 @@ COSTS = {
 }
 
 
-def as_json(value: Scalar) -> None:
+def as_json(value: object) -> None:
     """Print one JSON document to stdout; a number without a form in JSON becomes null."""
     typer.echo(json.dumps(replace_infinite(value), indent=2, allow_nan=False))
 
 
-def replace_infinite(value: Scalar) -> Scalar:
+def replace_infinite(value: object) -> object:
     """Return values with null in place of NaN and infinity, which JSON lacks."""
     if isinstance(value, dict):
         return {str(key): replace_infinite(item) for key, item in value.items()}
@@ -228,7 +228,7 @@ def show_files(result: JsonObject) -> None:
         say(f"{name}: {path}")
 
 
-def format_brief(value: Scalar) -> str:
+def format_brief(value: object) -> str:
     """Return a number with six digits, or the first four entries of a list."""
     if isinstance(value, list):
         return f"[{', '.join(map(format_brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"

@@ -15,7 +15,7 @@ import typer
 
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.cli import engine as engines
-from diffabs.core.types import JsonObject, Part
+from diffabs.core.types import JsonObject
 from diffabs.scenario.proving import Proved, certify_result, without_certificate
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.scenario.tuning import Work, build_work, describe_tuning
@@ -188,7 +188,7 @@ def _draw(work: Work, tuned: "Tuned", path: pathlib.Path) -> None:
     worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in scenario.tune.objective.items())))
     solver = dataclasses.replace(scenario.solver, every=min(scenario.solver.every, scenario.solver.steps))
 
-    def roll_out(loop: Part) -> Trajectory:
+    def roll_out(loop: object) -> Trajectory:
         run = jax.device_get(rollout(work.batch.lane(loop, worst), solver, key=scenario.key()))
         assert run.trajectory is not None
         return run.trajectory

@@ -6,17 +6,17 @@ of a lane once when it starts, and the rest in every step.
 
 import enum
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jax.extend.core import JaxprEqn
 from jax.typing import DTypeLike
 
 from diffabs.compiler.operations import MIRRORED, NEGATED, OPERATIONS
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Any, PyTree
 
-Array = Any  # NumPy array of nodes
+NodeArray: TypeAlias = np.ndarray  # of nodes
 
 
 class UpdateLevel(enum.IntEnum):
@@ -43,7 +43,7 @@ class Node:
 
     __slots__ = ("args", "attr", "dtype", "id", "label", "level", "op")
 
-    def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: PyTree, level: UpdateLevel):
+    def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: Any, level: UpdateLevel):
         """Store the fields. Only a `Graph` creates nodes."""
         self.id, self.op, self.args, self.dtype, self.attr, self.level = id, op, args, dtype, attr, level
         self.label = ""
@@ -79,7 +79,7 @@ class Graph:
         """Do nothing; a subclass may record that the following nodes come from the JAX equation `eqn`."""
 
     def _make(
-        self, op: str, args: tuple[Node, ...], dtype: DTypeLike, attr: PyTree = None, level: UpdateLevel | None = None
+        self, op: str, args: tuple[Node, ...], dtype: DTypeLike, attr: object = None, level: UpdateLevel | None = None
     ) -> Node:
         """Return the only node with these fields; without `level`, it changes as often as its most changing operand."""
         dtype = np.dtype(dtype)
@@ -90,7 +90,7 @@ class Graph:
             self._by_key[key] = self.nodes[-1]
         return self._by_key[key]
 
-    def const(self, value: Scalar, dtype: DTypeLike | None = None) -> Node:
+    def const(self, value: Any, dtype: DTypeLike | None = None) -> Node:
         """Return the constant `value` of type `dtype`."""
         x = np.asarray(value, dtype)[()]
         # The key has the bytes, because 0 == -0 and NaN != NaN.
@@ -100,7 +100,7 @@ class Graph:
             self._by_key[key] = self.nodes[-1]
         return self._by_key[key]
 
-    def input(self, dtype: DTypeLike, level: UpdateLevel, place: Scalar) -> Node:
+    def input(self, dtype: DTypeLike, level: UpdateLevel, place: Hashable) -> Node:
         """Return the input node of type `dtype` and level `level`; `place` (hashable) says where its value is from."""
         return self._make("input", (), dtype, place, level)
 

@@ -41,7 +41,7 @@ def _divide_towards_zero(x: PyTree, y: PyTree) -> PyTree:
     return x // y + ((x % y != 0) & ((x < 0) != (y < 0)))
 
 
-def _function(name: str, st: str | None = None, *, arity: int = 1, fold: PyTree = None) -> Operation:
+def _function(name: str, st: str | None = None, *, arity: int = 1, fold: object = None) -> Operation:
     """Return the row of a function that C99 calls `name` and `native/functions.h` k_`name`.
 
     ... in `st` stands for the operands. Without `fold`, constants are left to the back end.

@@ -35,7 +35,7 @@ from diffabs.compiler.program import ScalarProgram
 from diffabs.compiler.runtime import cpu, gpu, toolchain
 from diffabs.compiler.runtime.jax_primitive import bind_lanes
 from diffabs.compiler.trace import trace_functions
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Any, Array, PyTree, Scalar
 
 VECTORS_PER_BLOCK = 4
 
@@ -44,13 +44,13 @@ def run_lanes(
     renew: Callable[[PyTree, PyTree], PyTree],
     step: Callable[[PyTree, PyTree], PyTree],
     running: Callable[[PyTree, PyTree], PyTree],
-    lane: PyTree,
-    carry: PyTree,
+    lane: object,
+    carry: object,
     *,
     steps: int,
     rounds: int,
-    read: PyTree = None,
-    tangents_read: PyTree = None,
+    read: object = None,
+    tangents_read: object = None,
 ) -> PyTree:
     """Return the carry of n lanes after all have ended (pytree, leading axis n), with the structure of `carry`.
 
@@ -92,7 +92,7 @@ def run_lanes(
     arguments = [unwrap_key(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
     launch = functools.partial(_launch_lanes, shape=LaunchShape(VECTORS_PER_BLOCK, steps, rounds))
 
-    def true_leaves(mask: PyTree) -> tuple[int, ...] | None:
+    def true_leaves(mask: object) -> tuple[int, ...] | None:
         return None if mask is None else tuple(i for i, on in enumerate(jax.tree.leaves(mask)) if on)
 
     # Drop the traced arrays: this object outlives the trace, and a tracer must not leak. They are arguments instead.
@@ -128,18 +128,18 @@ def describe_kernel_build() -> dict[str, str]:
     return device.describe() if device else toolchain.describe_compiler()
 
 
-def _lane_type(x: Scalar) -> jax.ShapeDtypeStruct:
+def _lane_type(x: Array) -> jax.ShapeDtypeStruct:
     """Return shape and type of an array without its first axis, the axis of lanes."""
     return jax.ShapeDtypeStruct(jnp.shape(x)[1:], x.dtype)
 
 
-def unwrap_key(x: Scalar) -> Scalar:
+def unwrap_key(x: Array) -> Scalar:
     """Return random keys as their words (uint32, one more axis), and anything else as a JAX array."""
     if is_key(x):
         return jax.random.key_data(x)
     return x if isinstance(x, jax.Array) else jnp.asarray(x)
 
 
-def is_key(x: Scalar) -> bool:
+def is_key(x: Any) -> bool:
     """Return whether an array holds random keys."""
     return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

@@ -2,11 +2,11 @@
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel, is_real, live_nodes
+from diffabs.compiler.ir import Graph, Node, NodeArray, UpdateLevel, is_real, live_nodes
 from diffabs.compiler.lower.random import key_shape
 from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxpr
 from diffabs.compiler.trace import TracedFunctions
@@ -58,7 +58,7 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
     graph, inputs = Graph(), {}
     sizes: dict[UpdateLevel, list[int]] = {level: [] for level in functions.types}
 
-    def take_inputs(aval: Any, level: UpdateLevel) -> Array:
+    def take_inputs(aval: object, level: UpdateLevel) -> NodeArray:
         """Return the next array of a level as an array of new input nodes."""
         shape, dtype = key_shape(aval)
         array, out = len(sizes[level]), np.empty(shape, object)

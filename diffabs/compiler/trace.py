@@ -43,7 +43,7 @@ class TracedFunctions(NamedTuple):
 
 
 def trace_functions(
-    functions: dict[str, Callable[[PyTree, PyTree], PyTree]], lane: PyTree, carry: PyTree
+    functions: dict[str, Callable[[PyTree, PyTree], PyTree]], lane: object, carry: object
 ) -> TracedFunctions:
     """Return functions of (lane, carry) as jaxprs, with the arrays that they close over.
 
@@ -73,7 +73,7 @@ def trace_functions(
     return TracedFunctions(each, {level: [_type(x) for x in xs] for level, xs in types.items()}, uniform, names)
 
 
-def _leaf_names(tree: PyTree) -> list[str]:
+def _leaf_names(tree: object) -> list[str]:
     """Return the path of each leaf, such as point.state.plant.speed."""
     return [
         ".".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)

@@ -13,7 +13,7 @@ import re
 import reprlib
 import types
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ POSITIVE_SPEC = ParameterSpec("1", low=0.0, open_low=True)
 MIN_LIKENESS = 0.5  # least likeness of two names, of which one is probably a misspelling of the other
 PLAIN_TYPES = (str, bool, int, float, type(None))
 
+T = TypeVar("T")
 Reader = Callable[[Any, str], Any]
 
 
@@ -48,7 +49,7 @@ def dotted_path(path: str, key: str) -> str:
     return f"{path}.{key}" if path else key
 
 
-def format_given(value: Scalar, length: int = 60) -> str:
+def format_given(value: object, length: int = 60) -> str:
     """Return a value from TOML, JSON or the command line for a message: on one line, of bounded length."""
     if isinstance(value, datetime.date | datetime.time):
         return value.isoformat()
@@ -61,7 +62,7 @@ def format_given(value: Scalar, length: int = 60) -> str:
     return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
-def unknown_name_error(beginning: str, name: Any, names: Iterable[str]) -> ScenarioError:
+def unknown_name_error(beginning: str, name: object, names: Iterable[str]) -> ScenarioError:
     """Return the error for an unknown name, with its new name if it has one, else with the nearest existing name."""
     names = list(names)
     if new := current_name(str(name), names):
@@ -90,7 +91,7 @@ def _find_near_name(name: str, names: list[str]) -> str | None:
     return next(iter(difflib.get_close_matches(name.lower(), alike, 1, MIN_LIKENESS)), None)
 
 
-def wrong_kind_error(path: str, value: Scalar, needed: str) -> ScenarioError:
+def wrong_kind_error(path: str, value: object, needed: str) -> ScenarioError:
     """Return the error for a value of the wrong kind."""
     kinds = ((bool, "a boolean"), (str, "text"), ((int, float), "a number"), (list, "a list"), (dict, "a table"))
     kinds = (*kinds, (datetime.date | datetime.time, "a date or time"), (type(None), "nothing"))
@@ -98,7 +99,7 @@ def wrong_kind_error(path: str, value: Scalar, needed: str) -> ScenarioError:
     return ScenarioError(f"{path} = {format_given(value)} is {kind}; {needed} is needed")
 
 
-def read_number(value: Scalar, spec: ParameterSpec, path: str) -> float:
+def read_number(value: object, spec: ParameterSpec, path: str) -> float:
     """Return a number as a float, without a check of its range, which the messages show."""
     # bool is a subclass of int, so it is excluded first.
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
@@ -109,7 +110,7 @@ def read_number(value: Scalar, spec: ParameterSpec, path: str) -> float:
         raise ScenarioError(f"{path} = {format_given(value)} is too large for a number in {spec.interval()}") from None
 
 
-def read_number_in_range(value: Scalar, spec: ParameterSpec, path: str) -> float:
+def read_number_in_range(value: object, spec: ParameterSpec, path: str) -> float:
     """Return a number as a float."""
     number = read_number(value, spec, path)
     if not spec.holds(number):
@@ -140,7 +141,7 @@ def range_reader(spec: ParameterSpec) -> Reader:
 def choice_reader(*names: str) -> Reader:
     """Return the reader of one of several texts."""
 
-    def read(value: PyTree, path: str) -> str:
+    def read(value: object, path: str) -> str:
         if not isinstance(value, str):
             raise wrong_kind_error(path, value, f"one of {', '.join(names)}")
         if value not in names:
@@ -153,7 +154,7 @@ def choice_reader(*names: str) -> Reader:
 def list_reader(item: Reader) -> Reader:
     """Return the reader of lists, which it returns as tuples."""
 
-    def read(values: PyTree, path: str) -> tuple[PyTree, ...]:
+    def read(values: object, path: str) -> tuple[PyTree, ...]:
         if not isinstance(values, list | tuple):
             raise wrong_kind_error(path, values, "a list")
         return tuple(item(value, f"{path}.{i}") for i, value in enumerate(values))
@@ -164,7 +165,7 @@ def list_reader(item: Reader) -> Reader:
 def table_reader(item: Reader, contents: str = "") -> Reader:
     """Return the reader of tables with any keys."""
 
-    def read(table: PyTree, path: str) -> dict[str, PyTree]:
+    def read(table: object, path: str) -> dict[str, PyTree]:
         if not isinstance(table, Mapping):
             raise wrong_kind_error(path, table, f"a table of {contents}" if contents else "a table")
         return {key: item(value, dotted_path(path, key)) for key, value in table.items()}
@@ -178,14 +179,14 @@ def read_as_given(value: Scalar, path: str) -> Scalar:
     return value
 
 
-def read_text(value: PyTree, path: str) -> str:
+def read_text(value: object, path: str) -> str:
     """Return a text."""
     if not isinstance(value, str):
         raise wrong_kind_error(path, value, "text")
     return value
 
 
-def read_printable_line(value: PyTree, path: str) -> str:
+def read_printable_line(value: object, path: str) -> str:
     """Return a text that is one printable line."""
     line = read_text(value, path)
     if not line.isprintable():
@@ -193,7 +194,7 @@ def read_printable_line(value: PyTree, path: str) -> str:
     return line
 
 
-def read_printable_lines(value: PyTree, path: str) -> str:
+def read_printable_lines(value: object, path: str) -> str:
     """Return a text of printable lines."""
     text = read_text(value, path)
     if not all(line.isprintable() for line in text.split("\n")):
@@ -206,19 +207,19 @@ def make_printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
-def read_switch(value: PyTree, path: str) -> bool:
+def read_switch(value: object, path: str) -> bool:
     """Return true or false."""
     if not isinstance(value, bool):
         raise wrong_kind_error(path, value, "true or false")
     return value
 
 
-def read_any_number(value: PyTree, path: str) -> float:
+def read_any_number(value: object, path: str) -> float:
     """Return any number, also NaN and infinity, as a float."""
     return read_number(value, FINITE_SPEC, path)
 
 
-def _choice(value: PyTree, path: str) -> float | str:
+def _choice(value: object, path: str) -> float | str:
     """Return a text unchanged, or a number as a float."""
     return value if isinstance(value, str) else read_any_number(value, path)
 
@@ -234,20 +235,20 @@ READER_BY_TYPE: dict[PyTree, Reader] = {
 }
 
 
-def table_field(read: Reader, default: Any = dataclasses.MISSING) -> Scalar:
+def table_field(read: Reader, default: object = dataclasses.MISSING) -> Any:
     """Return the field of a dataclass with this reader; a default that can be called makes a new value each time."""
     if isinstance(default, type | types.FunctionType):
         return dataclasses.field(default_factory=default, metadata={"read": read})
     return dataclasses.field(default=default, metadata={"read": read})
 
 
-def read_table(cls: type, table: PyTree, path: str, kind: str = "", **readers: Reader) -> Scalar:
+def read_table(cls: type[T], table: object, path: str, kind: str = "", **readers: Reader) -> T:
     """Return the instance of a dataclass that a table describes.
 
     Args:
         readers: Readers by name of a field, in place of the one that the field declares.
     """
-    fields = {field.name: field for field in dataclasses.fields(cls)}
+    fields = {field.name: field for field in dataclasses.fields(cls)}  # pyright: ignore[reportArgumentType]  # a dataclass
     if not isinstance(table, Mapping):
         raise wrong_kind_error(path, table, f"a table of {', '.join(fields)}")
     values = {}
@@ -276,7 +277,7 @@ def find_field_faults(part: Part, name: str) -> Iterator[str]:
             yield str(error)
 
 
-def read_one(kinds: Mapping[str, type], value: PyTree, path: str, **readers: Reader) -> Scalar:
+def read_one(kinds: Mapping[str, type[T]], value: object, path: str, **readers: Reader) -> T:
     """Return an instance of one of several dataclasses, from a table with a key `type` or from the type's name alone.
 
     Args:
@@ -298,7 +299,7 @@ def check_sound(part: Part, name: str) -> PyTree:
     return part
 
 
-def as_plain(value: Scalar, *, brief: bool = False) -> PyTree:
+def as_plain(value: object, *, brief: bool = False) -> PyTree:
     """Return a value as TOML and JSON represent it: parts as tables, their numbers at full precision.
 
     With `brief`, tables omit fields with their default values.

@@ -160,7 +160,7 @@ class Sampled:
         early = jnp.maximum(jnp.minimum(rounding, self.delay), self.delay - (self.period - rounding))
         return t + self.delay - jax.lax.stop_gradient(early)
 
-    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: PyTree) -> tuple[PyTree]:
+    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: object) -> tuple[PyTree]:
         """Return the time until the waiting output applies [s], or 1 if no output waits."""
         del signal, rate
         return (jnp.where(memory.held.waits > 0.5, memory.held.until - t, 1.0),)
@@ -200,7 +200,7 @@ def _refuse_rate() -> PyTree:
     raise ValueError("the signal of a sampled controller has no rate: its `margins` cannot call rate()")
 
 
-def replace_nan(signal: PyTree) -> PyTree:
+def replace_nan(signal: object) -> PyTree:
     """Return a signal with 0 in place of NaN, so that a memory that starts from it is finite."""
     return jax.tree.map(lambda x: jnp.where(jnp.isnan(x), 0.0, x), signal)
 
@@ -218,7 +218,7 @@ class _AlwaysWaits(Sampled):
         return jnp.asarray(True)
 
 
-def inner_controller(controller: Part) -> PyTree:
+def inner_controller(controller: object) -> PyTree:
     """Return the controller inside a `Sampled`; any other controller, also `SampledOnGrid`, is returned unchanged."""
     return controller.controller if isinstance(controller, Sampled) else controller
 

@@ -55,7 +55,7 @@ class Relay:
         del t, signal
         return self.low + memory.held * (self.high - self.low)
 
-    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: PyTree) -> tuple[PyTree]:
+    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: object) -> tuple[PyTree]:
         """Return the signed distance to the switching edge, in the signal's unit: positive before the edge, negative
         beyond.
 

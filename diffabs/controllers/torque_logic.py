@@ -73,7 +73,7 @@ class FourPhase:
         """Return the lower and the upper limit of the control."""
         return 0.0 * self.torque_high, self.torque_high
 
-    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: PyTree) -> tuple[PyTree, PyTree]:
+    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: object) -> tuple[PyTree, PyTree]:
         """Return the rest of a change of the torque [control], and the rest of the slip of a hold [signal].
 
         The margin that does not belong to the present phase is 1.

@@ -21,7 +21,7 @@ import numpy as np
 
 from diffabs.core.kinds import find_value_objection, format_value
 from diffabs.core.pytree import ParameterSpec, parameters, replace
-from diffabs.core.types import AnyArray, Part, PyTree, Scalar
+from diffabs.core.types import AnyArray, PyTree, Scalar
 
 LOGARITHMIC_RATIO = 10.0  # ratio of the ends from which a range is mapped in the logarithm
 BOUND_STEEPNESS = 0.0396  # 4 s (1 - s) at s = 0.01: slope of the map at a hundredth of a range, relative to its middle
@@ -199,7 +199,7 @@ class FreeSpace:
         maps = [m for entry in self.entries for m in entry.maps]
         return np.array([float(m.steepness(x)) for m, x in zip(maps, z, strict=True)])
 
-    def place(self, part: Part) -> np.ndarray:
+    def place(self, part: object) -> np.ndarray:
         """Return z of the present values of `part`; one that is not inside its range is a ValueError."""
         present = {path: value for path, _, value in parameters(part)}
         values = [np.asarray(present[entry.path], float).ravel() for entry in self.entries]
@@ -224,7 +224,7 @@ class FreeSpace:
         return (np.log(u) - np.log1p(-u)) * np.where(bounded, 1.0, RANGE_END_SHARE)
 
 
-def parameter_space(part: Part, free: Sequence[str] | Mapping[str, Range | None]) -> FreeSpace:
+def parameter_space(part: object, free: Sequence[str] | Mapping[str, Range | None]) -> FreeSpace:
     """Return the space of some parameters of a part, as a map from an unbounded vector z.
 
     `free` has dotted paths, or ranges by path: pairs of numbers or of arrays of the parameter's shape; None is the

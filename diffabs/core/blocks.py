@@ -21,7 +21,7 @@ class Direct:
     start = no_memory
     flow = no_flow
 
-    def output(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
+    def output(self, t: Scalar, memory: Memory, signal: object) -> PyTree:
         """Return the signal."""
         del t, memory
         return signal
@@ -33,7 +33,7 @@ class Series:
 
     blocks: tuple[Block, ...] = part(default=(Direct(),))
 
-    def start(self, signal: PyTree) -> Memory:
+    def start(self, signal: object) -> Memory:
         """Return the memories, each started on the output of the blocks before it."""
         memories = []
         for block in self.blocks:
@@ -41,7 +41,7 @@ class Series:
             signal = block.output(0.0, memories[-1], signal)
         return _join_memories(memories)
 
-    def flow(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
+    def flow(self, t: Scalar, memory: Memory, signal: object) -> PyTree:
         """Return the rates of the blocks."""
         rates = []
         for block, m in self._pairs(memory):
@@ -49,7 +49,7 @@ class Series:
             signal = block.output(t, m, signal)
         return tuple(rates)
 
-    def output(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
+    def output(self, t: Scalar, memory: Memory, signal: object) -> PyTree:
         """Return the output of the last block."""
         for block, m in self._pairs(memory):
             signal = block.output(t, m, signal)
@@ -59,7 +59,7 @@ class Series:
         """Return whether one of the blocks has this hook."""
         return any(offers(block, hook) for block in self.blocks)
 
-    def tick(self, clock: Clock, memory: Memory, signal: PyTree) -> Memory:
+    def tick(self, clock: Clock, memory: Memory, signal: object) -> Memory:
         """Return the memories after the ticks of the blocks, in order; each block draws from its own random stream."""
         # `before` follows the signal before this instant: each block's old output is the next block's old input.
         memories, before = [], signal if clock.before is None else clock.before
@@ -70,7 +70,7 @@ class Series:
             memories.append(after)
         return _join_memories(memories)
 
-    def margins(self, t: Scalar, memory: Memory, signal: PyTree, rate: Callable[[], PyTree]) -> tuple[PyTree, ...]:
+    def margins(self, t: Scalar, memory: Memory, signal: object, rate: Callable[[], PyTree]) -> tuple[PyTree, ...]:
         """Return the margins of all blocks, in order."""
         margins: tuple[PyTree, ...] = ()
         for block, m in self._pairs(memory):
@@ -79,7 +79,7 @@ class Series:
             signal, rate = block.output(t, m, signal), partial(_output_rate, block, t, m, signal, rate)
         return margins
 
-    def event(self, t: Scalar, memory: Memory, signal: PyTree, fired: tuple[PyTree, ...]) -> Memory:
+    def event(self, t: Scalar, memory: Memory, signal: object, fired: tuple[PyTree, ...]) -> Memory:
         """Return the memories after the events of the blocks, in order."""
         memories = []
         for block, m in self._pairs(memory):
@@ -91,7 +91,7 @@ class Series:
             signal = block.output(t, m, signal)
         return _join_memories(memories)
 
-    def recorded_signals(self, t: Scalar, memory: Memory, signal: PyTree) -> tuple[PyTree, ...]:
+    def recorded_signals(self, t: Scalar, memory: Memory, signal: object) -> tuple[PyTree, ...]:
         """Return the inputs of the recording blocks, in order, for the input `signal` at time `t` with `memory`."""
         inputs: tuple[PyTree, ...] = ()
         for block, m in self._pairs(memory):
@@ -115,7 +115,7 @@ class Series:
         return [(b, Memory(f, h)) for b, f, h in zip(self.blocks, memory.flow, memory.held, strict=True)]
 
 
-def offers(block: Part, *hooks: str) -> bool:
+def offers(block: object, *hooks: str) -> bool:
     """Return whether a block has at least one of these optional methods; without names, `tick` or `margins`.
 
     A block with a method `offers(hook)`, such as `Series`, answers for the blocks in it.
@@ -144,7 +144,7 @@ def _join_memories(memories: Sequence[Memory]) -> Memory:
     return Memory(tuple(m.flow for m in memories), tuple(m.held for m in memories))
 
 
-def _output_rate(block: Block, t: Scalar, memory: Memory, signal: PyTree, rate: Callable[[], PyTree]) -> Scalar:
+def _output_rate(block: Block, t: Scalar, memory: Memory, signal: object, rate: Callable[[], PyTree]) -> Scalar:
     """Return d(output)/dt of a block for the rate of its input."""
     t, moving = jnp.asarray(t), rate()
     moves = (jnp.ones_like(t), block.flow(t, memory, signal), moving)
@@ -155,7 +155,7 @@ def _output_rate(block: Block, t: Scalar, memory: Memory, signal: PyTree, rate: 
 class NoFeedforward:
     """A feed-forward input of zero."""
 
-    def input(self, plant: Part, output: PyTree, target: Scalar) -> Scalar:
+    def input(self, plant: object, output: object, target: Scalar) -> Scalar:
         """Return zero, with the shape and type of `target`."""
         del plant, output
         return 0.0 * target  # zero with the shape and type of the target

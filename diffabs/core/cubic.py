@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp, later_of_larger
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Array, Bool, PyTree, Scalar
 
 NEWTON_ITERATIONS = 4  # from the secant's root, before the last: in a long step the cubic is far from a line
 
@@ -102,7 +102,7 @@ class Cubic(NamedTuple):
         return jnp.where(inside & (top > ends), top, ends)
 
     @property
-    def falls(self) -> Scalar:
+    def falls(self) -> Bool:
         """Whether p falls at the start."""
         return jax.lax.stop_gradient(self.start_slope) < 0
 
@@ -123,8 +123,8 @@ class HermiteStep(NamedTuple):
         rates: Time derivatives of the quantity at both ends, per second.
     """
 
-    start: Scalar
-    end: Scalar
+    start: Array
+    end: Array
     values: tuple[PyTree, PyTree]
     rates: tuple[PyTree, PyTree]
 

@@ -16,7 +16,7 @@ from diffabs.core.types import PyTree, Scalar
 _operation = jex.Primitive("first_order")
 
 
-def first_order(tangents: PyTree, why: str) -> PyTree:
+def first_order(tangents: object, why: str) -> PyTree:
     """Return tangents unchanged; their differentiation raises a ValueError with the message `why`."""
 
     def each(x: Scalar) -> PyTree:
@@ -33,7 +33,7 @@ def without_derivative(path: str, x: Scalar) -> Scalar:
 
 
 @without_derivative.defjvp
-def _raise_for_parameter(path: str, at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
+def _raise_for_parameter(path: str, at: object, moves: object) -> tuple[PyTree, PyTree]:
     # JAX calls this rule only if x has a tangent that is not a symbolic zero.
     del at, moves
     raise ValueError(
@@ -42,7 +42,7 @@ def _raise_for_parameter(path: str, at: PyTree, moves: PyTree) -> tuple[PyTree, 
     )
 
 
-def _raise_for_second_derivative(at: PyTree, moves: PyTree, *, why: str) -> PyTree:
+def _raise_for_second_derivative(at: object, moves: object, *, why: str) -> PyTree:
     del at, moves
     raise ValueError(why)
 

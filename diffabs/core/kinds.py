@@ -12,15 +12,15 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
+from jax.typing import ArrayLike, DTypeLike
 
-from diffabs.core.types import Scalar
+from diffabs.core.types import Any
 
 FEWEST_BITS = 32  # of a float: with 16 bits, the time stops advancing by small steps after a second
 MAX_SHOWN_LENGTH = 60  # characters of a value in a message
 
 
-def find_value_objection(value: Scalar) -> str:
+def find_value_objection(value: object) -> str:
     """Return why a value cannot be a number of a run or an array of numbers, such as `is text`; empty if it can.
 
     For an array only the type counts, so it may be traced. A Python integer beyond the range of a float is refused.
@@ -29,8 +29,8 @@ def find_value_objection(value: Scalar) -> str:
         return ""
     if isinstance(value, list | tuple | range):
         return next(filter(None, map(find_value_objection, value)), "")
-    if hasattr(value, "dtype"):
-        return _of_type(value.dtype)
+    if (dtype := getattr(value, "dtype", None)) is not None:
+        return _of_type(dtype)
     if isinstance(value, str | bytes):
         return "is text"
     if isinstance(value, bool):
@@ -40,7 +40,7 @@ def find_value_objection(value: Scalar) -> str:
     return "is complex" if isinstance(value, complex) else f"is of type {type(value).__name__}"
 
 
-def _overflows(value: Scalar) -> bool:
+def _overflows(value: Any) -> bool:
     return sys.float_info.max < abs(value) < math.inf
 
 
@@ -56,14 +56,14 @@ def _of_type(dtype: DTypeLike) -> str:
     return next((line for kind, line in kinds.items() if jnp.issubdtype(dtype, kind)), f"is of type {dtype}")
 
 
-def value_shape(value: Scalar) -> tuple[int, ...]:
+def value_shape(value: ArrayLike) -> tuple[int, ...]:
     """Return the shape of an array, also traced, a number, or a nested list, whose first item stands for all."""
     if isinstance(value, list | tuple | range):
         return (len(value), *(value_shape(value[0]) if value else ()))
     return np.shape(value)
 
 
-def format_value(value: Scalar) -> str:
+def format_value(value: object) -> str:
     """Return a value or an array for a message: on one line, of at most 60 characters."""
     try:
         text = " ".join(str(value).split()) if hasattr(value, "dtype") else repr(value).replace("\n", " ")

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Array, PyTree, Scalar
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["rows", "place", "row"], meta_fields=["lent"])
@@ -28,7 +28,7 @@ class Log:
     """
 
     rows: PyTree
-    place: Scalar
+    place: Array
     row: PyTree
     lent: bool = False
 
@@ -37,7 +37,7 @@ class Log:
         """Number of rows."""
         return len(self.rows)
 
-    def put(self, place: Scalar, row: PyTree) -> "Log":
+    def put(self, place: Array, row: object) -> "Log":
         """Return the log with `row` (n,) as the row at index `place`.
 
         `place` is a whole number, stored as an array of the row's type.
@@ -51,24 +51,24 @@ class Log:
         return jnp.where((places == self.place.astype(int))[:, None], self.row, rows) if self.lent else rows
 
 
-def log_rows(tree: PyTree) -> list[PyTree]:
+def log_rows(tree: object) -> list[PyTree]:
     """Return the rows of all logs in a pytree."""
     return [log.rows for log in jax.tree.leaves(tree, is_leaf=_is_log) if _is_log(log)]
 
 
-def borrow(tree: PyTree, rows: list[PyTree] | None) -> PyTree:
+def borrow(tree: object, rows: list[PyTree] | None) -> PyTree:
     """Return the tree with its logs lent to a solver, and with these rows (`log_rows`) in the logs, or without rows."""
     each = iter(rows or ())
     return _map_logs(lambda log: Log(next(each) if rows else None, log.place, log.row, lent=True), tree)
 
 
-def commit(tree: PyTree, rows: list[PyTree]) -> PyTree:
+def commit(tree: object, rows: list[PyTree]) -> PyTree:
     """Return the tree with its logs no longer lent: each has its rows, and among them the row written last."""
     each = iter(rows)
     return _map_logs(lambda log: Log(next(each), log.place, log.row).put(log.place, log.row), tree)
 
 
-def write_last_rows(tree: PyTree) -> list[PyTree]:
+def write_last_rows(tree: object) -> list[PyTree]:
     """Return the rows of all lent logs after the row written last is put in its place.
 
     If a step writes the previous step's row and then reads, the write happens in place. If it reads first, the write

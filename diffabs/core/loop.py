@@ -203,7 +203,7 @@ class Loop:
         """
         was, moved = _block_inputs(before), False
 
-        def change_block(name: str, signal: PyTree) -> Memory:
+        def change_block(name: str, signal: object) -> Memory:
             nonlocal state, moved
             block, memory = getattr(self, name), getattr(state, name)
             if name in fired:
@@ -230,18 +230,18 @@ class Loop:
         change_block("actuator", command)
         return state
 
-    def signal_rates(self, t: Scalar, state: LoopState, flow: PyTree) -> Signals:
+    def signal_rates(self, t: Scalar, state: LoopState, flow: object) -> Signals:
         """Return d(signals)/dt at time `t` in `state`, away from jumps, for d(state.flow())/dt equal to `flow`."""
         moves = (jnp.ones_like(jnp.asarray(t)), flow)
         return jax.jvp(lambda t, z: self.signals(t, state.with_flow(z)), (jnp.asarray(t), state.flow()), moves)[1]
 
-    def _track(self, t: Scalar, reference: Memory, measured: PyTree) -> Tracking:
+    def _track(self, t: Scalar, reference: Memory, measured: object) -> Tracking:
         target = self.reference.output(t, reference, measured)
         setpoint = self.reference.setpoint(reference)
         return Tracking(target, measured, self.feedforward.input(self.plant, measured, setpoint))
 
 
-def _jumps(component: PyTree) -> bool:
+def _jumps(component: object) -> bool:
     """Return whether a part, or a part in it, declares jumps; a block without a flow has nothing to integrate."""
     if getattr(type(component), "flow", None) is no_flow:
         return False

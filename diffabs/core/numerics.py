@@ -1,12 +1,15 @@
 """Elementary functions whose gradients stay finite where the textbook formulas fail."""
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Bool, PyTree, Scalar
+
+T = TypeVar("T")
 
 EQUAL_EPS = 1024.0  # in units of eps: difference of a signal between instants that are equal to rounding
 
@@ -28,7 +31,7 @@ def larger(x: Scalar, y: Scalar) -> Scalar:
     return jnp.where(jnp.greater_equal(x, y), x, y)
 
 
-def later_of_larger(x: Scalar, y: Scalar, falls: Scalar = False) -> PyTree:
+def later_of_larger(x: Scalar, y: Scalar, falls: Bool = False) -> PyTree:
     """Return max(x, y) of two successive values of a signal; where both are equal to rounding, it moves as y.
 
     At the end of a step of zero length, y moves with the event there, and x does not. If the signal falls at x, the
@@ -47,7 +50,7 @@ def smaller(x: Scalar, y: Scalar) -> Scalar:
     return jnp.where(jnp.less_equal(x, y), x, y)
 
 
-def invalidate(tree: PyTree, invalid: Scalar, inputs: PyTree) -> PyTree:
+def invalidate(tree: object, invalid: Bool, inputs: object) -> PyTree:
     """Return a pytree of real numbers; where they are invalid, they and their derivatives by every input are NaN.
 
     A selection (`jnp.where`) alone would give an invalid number the derivative zero. `inputs` is a pytree of everything
@@ -58,7 +61,7 @@ def invalidate(tree: PyTree, invalid: Scalar, inputs: PyTree) -> PyTree:
     return void_derivatives(jax.tree.map(lambda x: factor.astype(x.dtype) * x, numbers), invalid, inputs)
 
 
-def void_derivatives(tree: PyTree, void: Scalar, inputs: PyTree) -> PyTree:
+def void_derivatives(tree: object, void: Bool, inputs: object) -> PyTree:
     """Return a pytree of valid numbers whose derivatives by every input (`invalidate`) are NaN if `void`.
 
     In reverse mode one such number makes the whole derivative NaN.
@@ -168,7 +171,7 @@ def interpolate_shares(risen: Scalar, values: PyTree) -> Scalar:
     return values[0] + jnp.sum(risen * jnp.diff(values))
 
 
-def axpy(a: Scalar, x: Scalar, y: Scalar) -> PyTree:
+def axpy(a: Scalar, x: T, y: T) -> T:
     """Return a x + y on pytrees."""
     return jax.tree.map(lambda x, y: a * x + y, x, y)
 

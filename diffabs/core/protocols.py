@@ -58,7 +58,7 @@ there, too.
 """
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 from diffabs.core.messages import BalanceOutput as BalanceOutput
 from diffabs.core.messages import BrakeOutput as BrakeOutput
@@ -91,7 +91,7 @@ class Plant(Protocol):
     """
 
     @property
-    def shows(self) -> Scalar:
+    def shows(self) -> type[Any]:
         """Type of `output`, a NamedTuple whose class has `units` by name; a class attribute."""
         ...
 

@@ -27,7 +27,7 @@ from diffabs.core.arrays import as_array, as_rule_array
 from diffabs.core.compiling import is_traced
 from diffabs.core.meanings import document_fields
 from diffabs.core.renamed import RENAMED, current_name, refuse_old_names
-from diffabs.core.types import Params, Part, PyTree, Scalar
+from diffabs.core.types import Bool, Params, Part, PyTree, Scalar
 from diffabs.core.units import Units, resolve_unit, units_inside, units_of
 
 T = TypeVar("T")
@@ -72,7 +72,7 @@ class ParameterSpec:
         unit = resolve_unit(self.unit, units)
         return self if unit == self.unit else dataclasses.replace(self, unit=unit)
 
-    def within(self, value: Scalar) -> Scalar:
+    def within(self, value: Scalar) -> Bool:
         """Return whether every element of `value` lies in the range, also for traced numbers. NaN does not."""
         x = as_rule_array(value)
         # Comparisons that must be true, not ones that must be false: NaN fails each of them.
@@ -96,7 +96,7 @@ def param(
     infinite: bool = False,
     tunable: bool = True,
     free: bool = False,
-) -> Scalar:
+) -> Any:
     """Return the field of a parameter: one differentiable leaf, with the shape of its default.
 
     Args:
@@ -127,7 +127,7 @@ def param(
     return dataclasses.field(default=default, metadata={"spec": spec})
 
 
-def part(*, default: Any = dataclasses.MISSING) -> PyTree:
+def part(*, default: object = dataclasses.MISSING) -> Any:
     """Return a field that holds another part, or a tuple or list of parts; a default that is a class is called."""
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata={"part": True})
@@ -135,7 +135,7 @@ def part(*, default: Any = dataclasses.MISSING) -> PyTree:
     return dataclasses.field(default_factory=make, metadata={"part": True})
 
 
-def static(*, default: Any = dataclasses.MISSING) -> Scalar:
+def static(*, default: object = dataclasses.MISSING) -> Any:
     """Return a field known at trace time; another value causes another compilation."""
     return dataclasses.field(default=default, metadata={"static": True})
 
@@ -171,10 +171,10 @@ def _register(cls: type, data: list[str], meta: list[str]) -> None:
     the error.
     """
 
-    def flatten(part: Part) -> tuple[tuple[PyTree, ...], tuple[PyTree, ...]]:
+    def flatten(part: object) -> tuple[tuple[PyTree, ...], tuple[PyTree, ...]]:
         return tuple(getattr(part, name) for name in data), tuple(getattr(part, name) for name in meta)
 
-    def flatten_with_keys(part: Part) -> tuple[tuple[tuple[PyTree, PyTree], ...], tuple[PyTree, ...]]:
+    def flatten_with_keys(part: object) -> tuple[tuple[tuple[PyTree, PyTree], ...], tuple[PyTree, ...]]:
         leaves, statics = flatten(part)
         return tuple(zip(map(jax.tree_util.GetAttrKey, data), leaves, strict=True)), statics
 
@@ -184,7 +184,9 @@ def _register(cls: type, data: list[str], meta: list[str]) -> None:
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
 
 
-def parameters(part: Part, prefix: str = "", units: Units | None = None) -> Iterator[tuple[str, ParameterSpec, PyTree]]:
+def parameters(
+    part: object, prefix: str = "", units: Units | None = None
+) -> Iterator[tuple[str, ParameterSpec, PyTree]]:
     """Yield every parameter below a part as (dotted path, spec, value), in the order of declaration.
 
     Relative units are resolved by the given `units`, or else by the plant of the part or of a part in it. `prefix` is
@@ -198,7 +200,7 @@ def parameters(part: Part, prefix: str = "", units: Units | None = None) -> Iter
             yield from parameters(value, f"{name}.", units_inside(part, name.removeprefix(prefix), units))
 
 
-def children(part: Part, prefix: str) -> Iterator[tuple[str, dataclasses.Field[PyTree] | None, PyTree]]:
+def children(part: object, prefix: str) -> Iterator[tuple[str, dataclasses.Field[PyTree] | None, PyTree]]:
     """Yield (dotted path, field, value) of each field that is not static, without descending into the values.
 
     For a tuple or a list of parts it yields the items, with None as their field. For any other value it yields nothing.
@@ -215,7 +217,7 @@ def children(part: Part, prefix: str) -> Iterator[tuple[str, dataclasses.Field[P
                 yield prefix + field.name, field, getattr(part, field.name)
 
 
-def parts(part: Part) -> Iterator[PyTree]:
+def parts(part: object) -> Iterator[PyTree]:
     """Yield the parts directly in a part, but not the parts in those; items of a tuple or list count singly."""
     for _, field, value in children(part, ""):
         if field is None:
@@ -224,7 +226,7 @@ def parts(part: Part) -> Iterator[PyTree]:
             yield from value if isinstance(value, tuple | list) else (value,)
 
 
-def elements(part: Part) -> dict[str, ParameterSpec]:
+def elements(part: object) -> dict[str, ParameterSpec]:
     """Return the declaration of every single number below a part by path: `controller.gain.0` for one of an array."""
     specs: dict[str, ParameterSpec] = {}
     for path, spec, value in parameters(part):
@@ -356,7 +358,7 @@ def canonical_dtypes(tree: T) -> T:
         return structure.unflatten([as_array(x, dtype) for x in leaves])
 
 
-def prepare_parts(part: Part) -> PyTree:
+def prepare_parts(part: object) -> PyTree:
     """Return the part ready for a run: each part in it with a method `prepared()` is replaced by the method's result.
 
     The results hold precomputed values that stay constant during a run. Differentiable; a run does it once, inside its
@@ -365,7 +367,7 @@ def prepare_parts(part: Part) -> PyTree:
     return _rebuild_parts(part, "prepared", lambda prefix: ())
 
 
-def refine_parts(part: Part, times: int) -> PyTree:
+def refine_parts(part: object, times: int) -> PyTree:
     """Return the part for shorter steps: each part in it with a method `refined(times)` is replaced by its result.
 
     Such a part has a memory that covers a number of steps.
@@ -373,7 +375,7 @@ def refine_parts(part: Part, times: int) -> PyTree:
     return _rebuild_parts(part, "refined", lambda prefix: (times,))
 
 
-def prepare_derivatives(part: Part, paths: Iterable[str]) -> PyTree:
+def prepare_derivatives(part: object, paths: Iterable[str]) -> PyTree:
     """Return the part for derivatives by the parameters at these paths.
 
     Each part in it with a method `enable_derivatives(names)` is replaced by the method's result. `names` are the paths
@@ -386,7 +388,7 @@ def prepare_derivatives(part: Part, paths: Iterable[str]) -> PyTree:
     )
 
 
-def _rebuild_parts(part: Part, method: str, args: Callable[[str], tuple[PyTree, ...]], prefix: str = "") -> PyTree:
+def _rebuild_parts(part: object, method: str, args: Callable[[str], tuple[PyTree, ...]], prefix: str = "") -> PyTree:
     """Return the part, with the method's result in place of each part that has the method, the innermost first.
 
     `args` returns the method's arguments for the path of a part, with a final dot.

@@ -47,7 +47,7 @@ def order_rule(low: tuple[str, PyTree], high: tuple[str, PyTree], unit: str, *, 
     )
 
 
-def increase_rule(name: str, values: PyTree, broken: str, unit: str) -> Rule:
+def increase_rule(name: str, values: object, broken: str, unit: str) -> Rule:
     """Return the rule that each number is greater than the one before; `broken` is the message after the name."""
     x = as_rule_array(values)
     return Rule(

@@ -7,20 +7,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import JaxprEqn, Literal
 from jax.interpreters.partial_eval import dce_jaxpr
 
 from diffabs.core.first_order import first_order
 from diffabs.core.pytree import parameters
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import PyTree
 
 
-def differentiated_paths(tangents: PyTree) -> frozenset[str]:
+def differentiated_paths(tangents: object) -> frozenset[str]:
     """Return the paths of the parameters by which a part is differentiated, from tangents with symbolic zeros."""
     return frozenset(path for path, _, move in parameters(tangents) if type(move) is not SymbolicZero)
 
 
 def jvp_nonzero(
-    function: Callable[..., PyTree], primals: PyTree, tangents: PyTree, once: str = ""
+    function: Callable[..., PyTree], primals: object, tangents: object, once: str = ""
 ) -> tuple[PyTree, PyTree]:
     """Return function(*primals) and its derivative along the tangents, for a rule with `symbolic_zeros`.
 
@@ -42,7 +43,7 @@ def jvp_nonzero(
     return outputs, first_order(rate, once)
 
 
-def split_batched(make: Callable[[PyTree], PyTree], batch: PyTree) -> tuple[PyTree, Callable[[PyTree], PyTree]]:
+def split_batched(make: Callable[[PyTree], PyTree], batch: object) -> tuple[PyTree, Callable[[PyTree], PyTree]]:
     """Return (leaves, whole): the result of `make` for each member of a batch (n, ...), with constants kept apart.
 
     `leaves` are those leaves of the result that depend on the member, each (n, ...). `whole` takes these leaves for one
@@ -59,7 +60,7 @@ def split_batched(make: Callable[[PyTree], PyTree], batch: PyTree) -> tuple[PyTr
     moves = [not hasattr(v, "val") and v in depends for v in program.jaxpr.outvars]
     fixed, tree = jax.tree.leaves(make(first)), jax.tree.structure(shape)
 
-    def moving_outputs(member: PyTree) -> list[PyTree]:
+    def moving_outputs(member: object) -> list[PyTree]:
         return [x for x, on in zip(jax.tree.leaves(make(member)), moves, strict=True) if on]
 
     def whole(leaves: list[PyTree]) -> Any:
@@ -69,12 +70,12 @@ def split_batched(make: Callable[[PyTree], PyTree], batch: PyTree) -> tuple[PyTr
     return jax.vmap(moving_outputs)(batch) if any(moves) else [], whole
 
 
-def depends_on_signal(function: Callable[[PyTree], PyTree], signal: PyTree) -> bool:
+def depends_on_signal(function: Callable[[PyTree], PyTree], signal: object) -> bool:
     """Return whether a function's traced result depends on its signal; a product with a literal zero does not count."""
     return any(leaf_dependence(function, signal))
 
 
-def leaf_dependence(function: Callable[[PyTree], PyTree], signal: PyTree) -> list[bool]:
+def leaf_dependence(function: Callable[[PyTree], PyTree], signal: object) -> list[bool]:
     """Return for each leaf of a signal, in order, whether a function depends on it (`depends_on_signal`)."""
     return used_inputs(jax.make_jaxpr(function)(signal).jaxpr, lambda step: not _zero(step))
 
@@ -123,6 +124,6 @@ def scan_input_counts(params: Any, inputs: int) -> tuple[int, int]:
     return len(groups[0]), len(groups[1])
 
 
-def _zero(step: Scalar) -> bool:
+def _zero(step: JaxprEqn) -> bool:
     """Return whether an equation of a jaxpr multiplies by a literal zero."""
-    return step.primitive.name == "mul" and any(np.all(v.val == 0) for v in step.invars if hasattr(v, "val"))
+    return step.primitive.name == "mul" and any(np.all(v.val == 0) for v in step.invars if isinstance(v, Literal))

@@ -30,7 +30,7 @@ def units_of(plant: Part) -> Units | None:
     return Units(plant.control_unit, next(iter(shown.values())), tuple(shown.items())) if shown else None
 
 
-def units_inside(part: Part, name: str, units: Units | None) -> Units | None:
+def units_inside(part: object, name: str, units: Units | None) -> Units | None:
     """Return the units for the part in the field `name` of another part.
 
     They are those of the other part, unless it has a method `units_inside(name, units)`.

@@ -15,13 +15,13 @@ import numpy as np
 from diffabs.core import kinds
 from diffabs.core.pytree import ParameterSpec, children, parameters, stack_lists
 from diffabs.core.rules import Rule
-from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.core.types import PyTree, Scalar
 from diffabs.core.units import Units, insert_unit, units_inside, units_of
 
 T = TypeVar("T")
 
 
-def find_problems(part: Part, prefix: str = "", units: Units | None = None) -> Iterator[str]:
+def find_problems(part: object, prefix: str = "", units: Units | None = None) -> Iterator[str]:
     """Yield one line for each field that is out of range, and for each condition of the parts that fails.
 
     For each part, four groups are checked in order: its numbers and the parts in it, the shapes of its numbers, its
@@ -49,7 +49,7 @@ def find_problems(part: Part, prefix: str = "", units: Units | None = None) -> I
         yield from (prefix + insert_unit(line, units) for line in shapes or find_broken(_from_hook(part, "rules")))
 
 
-def part_rules(part: Part, prefix: str = "") -> Iterator[Rule]:
+def part_rules(part: object, prefix: str = "") -> Iterator[Rule]:
     """Yield every rule of a part and of the parts in it, first the ranges of fields.
 
     These are the ranges and rules of `find_problems` in array form, for runs with different values. Only `problems` is
@@ -63,7 +63,7 @@ def part_rules(part: Part, prefix: str = "") -> Iterator[Rule]:
     yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "rules")
 
 
-def grid_rules(part: Part, step: float, prefix: str = "") -> Iterator[Rule]:
+def grid_rules(part: object, step: float, prefix: str = "") -> Iterator[Rule]:
     """Yield the rules of the parts on an integration step [s]."""
     yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "grid_rules", step)
 
@@ -73,13 +73,13 @@ def find_broken(rules: Iterable[Rule]) -> Iterator[str]:
     yield from (rule.says() for rule in rules if not bool(rule.holds))
 
 
-def _from_hook(part: Part, hook: str, *args: PyTree) -> Iterator[Any]:
+def _from_hook(part: object, hook: str, *args: PyTree) -> Iterator[Any]:
     """Yield the rules or lines from a method of this part alone."""
     if hasattr(part, hook):
         yield from getattr(part, hook)(*args)
 
 
-def _below(part: Part, prefix: str, units: Units | None, hook: str, *args: PyTree) -> Iterator[Any]:
+def _below(part: object, prefix: str, units: Units | None, hook: str, *args: PyTree) -> Iterator[Any]:
     """Yield the rules or lines from a method of the part and of the parts in it, the innermost first."""
     for name, field, value in children(part, prefix):
         if field is None or "spec" not in field.metadata:
@@ -88,7 +88,7 @@ def _below(part: Part, prefix: str, units: Units | None, hook: str, *args: PyTre
         yield finding.under(prefix, units) if isinstance(finding, Rule) else prefix + insert_unit(finding, units)
 
 
-def find_misshapen(part: Part, prefix: str = "") -> Iterator[str]:
+def find_misshapen(part: object, prefix: str = "") -> Iterator[str]:
     """Yield one line for each parameter of the wrong type or shape in an unbatched part, or else its `problems`.
 
     The values may be traced.
@@ -115,7 +115,7 @@ def _find_wrong_shape(spec: ParameterSpec, value: Scalar) -> str:
     return "" if spec.shape in (None, shape) else f"has shape {shape}; it needs {spec.shape}"
 
 
-def find_cautions(part: Part, prefix: str = "") -> Iterator[str]:
+def find_cautions(part: object, prefix: str = "") -> Iterator[str]:
     """Yield one line for each setting that is allowed but hardly intended (`cautions`)."""
     yield from _below(part, prefix, None, "cautions")
 

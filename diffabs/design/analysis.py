@@ -13,13 +13,13 @@ no program: a P that is not definite proves it.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.numerics import spectral_bound
-from diffabs.core.types import Matrix
+from diffabs.core.types import AnyArray
 from diffabs.design import instability, pairs
 from diffabs.design.bounds import BOUND_LOOSENINGS, Bounds, decrease_matrix
 from diffabs.design.polytopes import Polytope, Schedule, as_gain_matrix
@@ -40,7 +40,7 @@ MAX_SEARCH_PROGRAMS = 20  # programs of the search for the fastest decay, at mos
 
 @default_flags()
 def certify(
-    gain: Matrix, system: Polytope | Schedule, spec: Spec | None = None, *, fastest: bool = False
+    gain: Sequence[float] | AnyArray, system: Polytope | Schedule, spec: Spec | None = None, *, fastest: bool = False
 ) -> Certificate:
     """Return the proved properties of u = K x: quadratic stability or its impossibility, and each specification.
 

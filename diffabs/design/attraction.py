@@ -13,7 +13,7 @@ the same starts. Its time T is so early that a run that will fall has not yet la
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ import numpy as np
 
 from diffabs.controllers.balance import state_of
 from diffabs.core.loop import Loop
-from diffabs.core.types import Matrix, Params, Part, PyTree, Scalar
+from diffabs.core.types import AnyArray, Array, Bool, Params, PyTree, Scalar
 from diffabs.design.capture import capture_ellipsoids
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.ensemble import run_batch
@@ -107,17 +107,17 @@ class _Ellipsoids(NamedTuple):
     Run i belongs to the system `system[i]`.
     """
 
-    roots: Any
-    hopeless: Scalar
-    system: Part
+    roots: AnyArray
+    hopeless: AnyArray
+    system: AnyArray
 
-    def data_of(self, number: Scalar) -> Matrix:
+    def data_of(self, number: Scalar) -> tuple[Array, Array]:
         """Return R and the instability flag of run `number`."""
         # An empty slot of a packed batch has a number beyond the last run.
         system = self.system[jnp.minimum(number, len(self.system) - 1)]
         return self.roots[system], self.hopeless[system]
 
-    def has_reached(self, data: PyTree, output: PyTree) -> Scalar:
+    def has_reached(self, data: PyTree, output: PyTree) -> Bool:
         """Return whether a run is inside its ellipsoid, with a margin, or unstable."""
         root, hopeless = data
         return (jnp.sum((root @ state_of(output)) ** 2) <= CAPTURE_LEVEL) | hopeless
@@ -133,7 +133,7 @@ def classify_starts(
     solver: Solver,
     *,
     band: float | None = None,
-    key: PyTree = None,
+    key: object = None,
     engine: str = "auto",
 ) -> Outcomes:
     """Return the outcome of each run within the solver's duration, shape (runs,).
@@ -199,7 +199,7 @@ def region_of_attraction(
     *,
     paths: tuple[str, str] = ("initial.theta", "initial.phi"),
     band: float | None = None,
-    key: PyTree = None,
+    key: object = None,
     engine: str = "auto",
 ) -> Basin:
     """Return the region of attraction of a balance over the cells of two axes, the first axis in rows: shape (n, m).
@@ -252,7 +252,7 @@ def recoverable_multiple(
     *,
     largest: float = 1.0,
     band: float | None = None,
-    key: PyTree = None,
+    key: object = None,
     engine: str = "auto",
 ) -> Reach:
     """Return the largest c in [0, `largest`] up to which the loop recovers from every tried multiple of `direction`.

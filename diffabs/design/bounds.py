@@ -1,11 +1,11 @@
 """Bounds that a common P proves for a gain: the smallest cost, L2 gain and inputs, and a given damping ratio."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from diffabs.core.types import Matrix, PyTree, Scalar
+from diffabs.core.types import PyTree
 from diffabs.design.polytopes import Polytope
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Claim
@@ -20,7 +20,7 @@ from diffabs.design.spec import Spec
 BOUND_LOOSENINGS = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 
 
-def decrease_matrix(p: Matrix, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
+def decrease_matrix(p: np.ndarray, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
     """Return the matrix of -dV/dt - 2 rate V (..., n, n) for V = x'P x along dx/dt = C x; it is > 0 if V falls faster.
 
     In discrete time, x+ = C x, it is the matrix of exp(-2 rate) V - V+, with the rate per step.
@@ -64,7 +64,7 @@ class Bounds:
         # Rounded up: the proof requires cot^2 (1 - zeta^2) >= zeta^2 exactly.
         cot = zeta / math.sqrt(1 - zeta**2) * (1 + 1e-12)
 
-        def cone(v: Scalar, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+        def cone(v: Mapping[str, np.ndarray], c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
             return [damping_matrix(v["P"] @ c / np.linalg.norm(c), cot) - v["t"] * np.eye(2 * len(c))]
 
         return self._solve_in_frame(
@@ -88,7 +88,7 @@ class Bounds:
         at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
         input_matrix = None if l2.disturbance is None else at.inverse @ l2.disturbance / math.sqrt(at.tau)
 
-        def gain_inequalities(v: Scalar, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+        def gain_inequalities(v: Mapping[str, np.ndarray], c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
             e = at.inverse @ b / math.sqrt(at.tau) if input_matrix is None else input_matrix
             limit = v["g"] * np.eye(e.shape[1])
             # 1e-10 keeps the answer strictly inside the inequality that the exact proof requires.
@@ -126,7 +126,7 @@ class Bounds:
         # P scales as 1/size^2: the unknown is P size^2, near the unit matrix for starts in any unit.
         starts_size = float(np.linalg.norm(starts, axis=0).max())
 
-        def input_inequalities(v: Scalar) -> list[np.ndarray]:
+        def input_inequalities(v: Mapping[str, np.ndarray]) -> list[np.ndarray]:
             p = v["P"]
             inside = [1 - starts_size**-2 * (x @ p @ x)[..., None, None] for x in starts.T]
             return inside + [symmetric_from_blocks([[p], [row[None] * starts_size, v["g"]]]) for row in rows]

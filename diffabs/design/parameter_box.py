@@ -13,15 +13,18 @@ import itertools
 import numbers
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 
+if TYPE_CHECKING:
+    from scipy.spatial import ConvexHull
+
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.pytree import parameters, replace
 from diffabs.core.renamed import refuse_old_names
-from diffabs.core.types import AnyArray, Matrix, Part, PyTree
+from diffabs.core.types import AnyArray, Part, PyTree
 from diffabs.core.validity import check_part
 from diffabs.design.polytopes import MAX_VERTICES, Coverage, Polytope, Schedule
 
@@ -105,7 +108,7 @@ def polytope(model: Part, over: Mapping[str, Sequence[float]], *, grid: int = 9,
 
 
 def schedule(
-    model: Part, over: Mapping[str, Sequence[float]], along: str, nodes: int | Sequence[float], **options: Any
+    model: object, over: Mapping[str, Sequence[float]], along: str, nodes: int | Sequence[float], **options: Any
 ) -> Schedule:
     """Return a chain of polytopes: the box {path: (low, high)}, cut along one of its parameters at `nodes`.
 
@@ -165,7 +168,7 @@ def _batch(model: Part, free: tuple[str, ...], points: PyTree) -> AnyArray:
     return jax.vmap(lambda p: replace(model, dict(zip(free, p, strict=True))).matrices())(points)
 
 
-def evaluate_systems(model: Part, free: tuple[str, ...], points: np.ndarray) -> _SystemRows:
+def evaluate_systems(model: object, free: tuple[str, ...], points: np.ndarray) -> _SystemRows:
     """Return the systems at points (N, k) of the free parameters, in float64; A and B are its property `matrices`."""
     parts, n, m = [], 0, 0
     # Rounding of float32 would exceed the tolerance of the gauge.
@@ -184,7 +187,7 @@ def evaluate_systems(model: Part, free: tuple[str, ...], points: np.ndarray) -> 
 
 
 def evaluate_grid(
-    model: Part, over: Mapping[str, Sequence[float]], points: int
+    model: object, over: Mapping[str, Sequence[float]], points: int
 ) -> tuple[_SystemRows, tuple[dict[str, float], ...], Part]:
     """Return the systems on a grid over a box, ends included, their parameters by path, and the model at the low ends.
 
@@ -210,7 +213,7 @@ def _points(box: np.ndarray, grid: int, limit: int, seed: int) -> np.ndarray:
 
 
 def _cover_box(
-    model: Part, free: tuple[str, ...], box: np.ndarray, corners: _SystemRows, grid: int, limit: int
+    model: object, free: tuple[str, ...], box: np.ndarray, corners: _SystemRows, grid: int, limit: int
 ) -> tuple[np.ndarray, Sequence[int], Coverage]:
     """Return the vertices as rows, their corner numbers, and the coverage."""
     if not free:
@@ -338,7 +341,7 @@ def _extreme_points(v: np.ndarray) -> list[int]:
     return sorted(np.unique(v.round(12), axis=0, return_index=True)[1].tolist())
 
 
-def _facets(v: np.ndarray) -> Matrix:
+def _facets(v: np.ndarray) -> "ConvexHull | None":
     """Return the hull of v (V, d), or None for too many facets or facets that merge by rounding (64 points in 6-d)."""
     from scipy.spatial import ConvexHull, QhullError
 

@@ -9,12 +9,12 @@ B) of the same parameters.
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from diffabs.core.kinds import find_value_objection, format_value
-from diffabs.core.types import AnyArray, Matrix
+from diffabs.core.types import AnyArray
 
 MAX_VERTICES = 2**12  # each vertex adds an LMI
 
@@ -98,7 +98,7 @@ class Polytope:
         """Number of inputs m."""
         return self.B.shape[2]
 
-    def closed_loop(self, gain: Matrix) -> np.ndarray:
+    def closed_loop(self, gain: Sequence[float] | AnyArray) -> np.ndarray:
         """Return A + B K at each vertex for K = `gain`, shape (V, n, n).
 
         Raises:
@@ -135,7 +135,7 @@ class Schedule:
             raise ValueError("the cells of a schedule differ in order, inputs or period")
 
 
-def as_gain_matrix(gain: AnyArray, shape: tuple[int, int]) -> np.ndarray:
+def as_gain_matrix(gain: Sequence[float] | AnyArray, shape: tuple[int, int]) -> np.ndarray:
     """Return a gain (m, n) or (n,) as a matrix of floats of this shape."""
     if objection := find_value_objection(gain):
         raise ValueError(f"gain = {format_value(gain)} {objection}")

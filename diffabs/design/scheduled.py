@@ -12,12 +12,13 @@ and K at a, at b, and mixed.
 The speed of a braking car falls no faster than friction allows. A common P would also admit jumps of the speed.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from diffabs.core.numerics import spectral_bound
-from diffabs.core.types import AnyArray, Matrix, PyTree, Scalar
+from diffabs.core.types import AnyArray, PyTree
 from diffabs.design.bounds import BOUND_LOOSENINGS
 from diffabs.design.polytopes import Schedule, as_gain_matrix
 from diffabs.design.proof import exact
@@ -31,7 +32,9 @@ from diffabs.design.spec import Spec
 SCHEDULE_DECAY_TOLERANCE = 0.01  # relative width at which the search for the fastest decay stops
 
 
-def certify_schedule(gain: AnyArray, system: Schedule, spec: Spec, *, fastest: bool = False) -> Certificate:
+def certify_schedule(
+    gain: Sequence[float] | AnyArray, system: Schedule, spec: Spec, *, fastest: bool = False
+) -> Certificate:
     """Return the proved properties, of decay and cost only, of a gain on a schedule, with a parameter-dependent P(p).
 
     One claim proves `spec.decay` (0 for stability alone). With Q and R another one, with its own P(p), proves the cost.
@@ -65,7 +68,7 @@ def _fastest_decay_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Cla
     return best
 
 
-def gains_at_nodes(gain: AnyArray, system: Schedule) -> np.ndarray:
+def gains_at_nodes(gain: Any, system: Schedule) -> np.ndarray:
     """Return the gains at the nodes, shape (N + 1, m, n); a constant gain has shape (m, n) or (n,)."""
     shape = (system.cells[0].inputs, system.cells[0].order)
     if np.ndim(gain) < 3:
@@ -126,8 +129,8 @@ def _bernstein_formulas(gains: np.ndarray, system: Schedule, spec: Spec, frame: 
             for rate in sorted(set(spec.rates)):
                 # The defaults bind the loop variables at the definition: a formula may run after the loop has moved on.
                 def coefficients(
-                    v: Mapping[str, np.ndarray], i: int = i, c: Scalar = closed, q: Matrix = price, s: float = size,
-                    drift: float = rate / width / frame.tau,
+                    v: Mapping[str, np.ndarray], i: int = i, c: tuple[np.ndarray, np.ndarray] = closed,
+                    q: list[np.ndarray] = price, s: float = size, drift: float = rate / width / frame.tau,
                 ) -> list[np.ndarray]:  # fmt: skip
                     start, end = v[f"P{i}"], v[f"P{i + 1}"]
                     # dP/dt is constant along the cell, so all three Bernstein coefficients contain it in full.

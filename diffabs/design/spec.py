@@ -28,7 +28,7 @@ class InputLimit:
         points: Starts, shape (k, n), or (n,) for one; not all zero.
     """
 
-    limit: Scalar
+    limit: Any
     points: PyTree
 
 
@@ -67,8 +67,8 @@ class Spec:
         rates: Lowest and highest d(parameter)/dt of a `Schedule`, in the parameter's unit per second.
     """
 
-    Q: Matrix = None
-    R: Matrix = None
+    Q: Any = None
+    R: Any = None
     decay: float = 0.0
     damping: float = 0.0
     input: InputLimit | None = None

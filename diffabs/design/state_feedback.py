@@ -115,7 +115,7 @@ def reduce_balance_loop(loop: Loop) -> ReducedLoop:
     return ReducedLoop(model, np.asarray(controller.gain, float), exact, tuple(neglected))
 
 
-def _read_sampling(controller: Part) -> Sampling | Continuous:
+def _read_sampling(controller: object) -> Sampling | Continuous:
     if isinstance(controller, Sampled):
         return Sampling(period=float(controller.period), delay=float(controller.delay))
     return Continuous()
@@ -152,7 +152,7 @@ def _reduce_at_rest(loop: Loop) -> ReducedLoop:
     return ReducedLoop(model, np.asarray(model.gain(), float), True, tuple(neglected))
 
 
-def _gains(controller: Part) -> tuple[PyTree, PyTree, PyTree, PyTree]:
+def _gains(controller: object) -> tuple[PyTree, PyTree, PyTree, PyTree]:
     """Return the gains on integral, slip error, and slip error minus filtered slip error, and the filter's cutoff."""
     if isinstance(controller, StateFeedback | ProportionalFeedback):
         return controller.gain[0], controller.gain[1], 0.0, 0.0
@@ -162,7 +162,7 @@ def _gains(controller: Part) -> tuple[PyTree, PyTree, PyTree, PyTree]:
     raise ValueError(f"controller {_part_name(controller)} is not linear: it cannot be brought to state feedback")
 
 
-def _actuator(actuator: Part) -> tuple[Direct | Lag, tuple[str, ...], bool]:
+def _actuator(actuator: object) -> tuple[Direct | Lag, tuple[str, ...], bool]:
     """Return the linear actuator, its neglected parts, and whether it is exact near the target."""
     blocks = actuator.blocks if isinstance(actuator, Series) else (actuator,)
     lags, neglected, exact = [], [], True
@@ -214,6 +214,6 @@ def _loop_omissions(loop: Loop) -> Iterator[str]:
         yield f"The error of the feed-forward ({_part_name(loop.feedforward)}), a disturbance."
 
 
-def _part_name(part: Part) -> str:
+def _part_name(part: object) -> str:
     """Return the name of a part in words: `sliding mode` for SlidingMode."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower()

@@ -166,7 +166,7 @@ def _reject_duplicate_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return members
 
 
-def _certificate_from_json(value: Any) -> StoredCertificate:
+def _certificate_from_json(value: object) -> StoredCertificate:
     file = _read_members(value, "the file", "format", "version", "system", "gain", "claims")
     if file["format"] != "diffabs certificate" or file["version"] != 1.0:
         raise ValueError("format and version are not those of a diffabs certificate, 1")
@@ -194,7 +194,7 @@ def _certificate_from_json(value: Any) -> StoredCertificate:
     return StoredCertificate(list(cells), nodes, gains if tables else [gains] * max(len(nodes), 1), discrete, read)
 
 
-def _read_cell(value: Any, where: str, sizes: dict[str, int]) -> tuple[Cell, float | None]:
+def _read_cell(value: object, where: str, sizes: dict[str, int]) -> tuple[Cell, float | None]:
     part = _read_members(value, where, "A", "B", "period", "states", "corners")
     sizes.pop("V", None)  # every cell has its own number of vertices
     a, b = (
@@ -209,7 +209,7 @@ def _read_cell(value: Any, where: str, sizes: dict[str, int]) -> tuple[Cell, flo
 
 
 def _read_claim(
-    value: Any, where: str, sizes: dict[str, int], discrete: bool, scheduled: bool
+    value: object, where: str, sizes: dict[str, int], discrete: bool, scheduled: bool
 ) -> tuple[str, dict[str, Any]]:
     claim = _read_members(value, where, "kind", "data")
     kind, data = claim["kind"], claim["data"]
@@ -240,17 +240,17 @@ def _read_claim(
     return kind, tensors
 
 
-def _read_members(value: Any, where: str, *names: str) -> dict[str, Any]:
+def _read_members(value: object, where: str, *names: str) -> dict[str, Any]:
     if not isinstance(value, dict) or set(value) != set(names):
         raise ValueError(f"{where} must have the members {', '.join(names)} and no other")
     return value
 
 
-def _depth(value: Any) -> int:
+def _depth(value: object) -> int:
     return 1 + _depth(value[0]) if isinstance(value, list) and value else 0
 
 
-def _read_tensor(value: Any, letters: str, sizes: dict[str, int], where: str) -> Any:
+def _read_tensor(value: object, letters: str, sizes: dict[str, int], where: str) -> Any:
     """Return fractions in nested lists whose axes have the sizes of the letters; a new letter gets its size here."""
     if not letters:
         if type(value) is not float or not math.isfinite(value):
@@ -489,7 +489,7 @@ def _describe_claim(kind: str, d: Mapping[str, Any], discrete: bool) -> str:
     return f"stable, with a decay of at least {pace}, however the system varies"
 
 
-def _describe_numbers(name: str, value: Any) -> str:
+def _describe_numbers(name: str, value: object) -> str:
     """Return the name and the entries of nested lists, or their sizes if the entries are many."""
     sizes, part = [], value
     while isinstance(part, list):

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from diffabs.core.types import JsonObject, PyTree
+from diffabs.core.types import JsonObject
 from diffabs.explore.panels import Curves, Fan, Panel
 from diffabs.explore.stability import Stability
 
@@ -161,7 +161,7 @@ def _points(values: np.ndarray, period: float | None) -> list[list[float]]:
     return [[float(f"{p.real:.5g}"), float(f"{p.imag:.5g}")] for p in poles]
 
 
-def round_for_screen(values: PyTree) -> list[float | None]:
+def round_for_screen(values: object) -> list[float | None]:
     """Return numbers rounded to `CHART_DIGITS` digits, with None for numbers that are not finite."""
     numbers = np.asarray(values, float).tolist()
     return [float(f"{x:.{CHART_DIGITS}g}") if math.isfinite(x) else None for x in numbers]

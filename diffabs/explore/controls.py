@@ -179,7 +179,7 @@ class Controls:
                 self.sliders[key] = slider
 
     # The arguments come from the browser, so their types are checked.
-    def _take_slider(self, key: str, place: Scalar, edit: Any) -> None:
+    def _take_slider(self, key: str, place: Scalar, edit: object) -> None:
         knob = self.session.knobs.get(key)
         if knob is None or knob.low is None or not isinstance(place, int | float) or not 0 <= place <= SLIDER_STEPS:
             return

@@ -42,7 +42,7 @@ def without_factor(scenario: "Scenario", original: "Scenario") -> "Scenario":
     return _rename_paths(scenario, plant, lambda path: ROAD + path[len(INNER) :] if path.startswith(INNER) else path)
 
 
-def _rename_paths(scenario: "Scenario", plant: Part, name: Callable[[str], str]) -> "Scenario":
+def _rename_paths(scenario: "Scenario", plant: object, name: Callable[[str], str]) -> "Scenario":
     def keys(table: Table) -> JsonObject:
         return {name(path): value for path, value in table.items()}
 

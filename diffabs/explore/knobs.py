@@ -9,7 +9,7 @@ import numpy as np
 from diffabs.config.values import read_number_in_range, wrong_kind_error
 from diffabs.core.meanings import field_meanings
 from diffabs.core.pytree import ParameterSpec, get, parameters
-from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.core.types import Part, Scalar
 from diffabs.core.units import unit_at
 from diffabs.explore.friction import FACTOR_PATH
 from diffabs.runtime.separated import read_decimal
@@ -60,7 +60,7 @@ class Knob:
         """Path of this number, with its index in a list."""
         return self.path if self.place is None else f"{self.path}.{self.place}"
 
-    def read(self, value: PyTree) -> float:
+    def read(self, value: object) -> float:
         """Return a typed or dragged `value`, in the displayed unit, in SI."""
         if isinstance(value, str):
             try:

@@ -147,7 +147,7 @@ class Page:
         self.tuner.end()
 
     # Methods that run in the server's thread.
-    def _change(self, key: str, value: PyTree, edit: int) -> None:
+    def _change(self, key: str, value: object, edit: int) -> None:
         """Apply a dragged or typed number."""
         try:
             self.session.put(key, value)
@@ -158,7 +158,7 @@ class Page:
         self.controls.show(key)
         self.redraw(edit)
 
-    def _widen(self, name: str, value: PyTree) -> bool:
+    def _widen(self, name: str, value: object) -> bool:
         """Apply another spread of the fan, and return whether it is valid."""
         try:
             self.session.widen(name, value)
@@ -233,7 +233,7 @@ class Page:
             if self.shown is None:
                 self.end_line.set_text("no run")
 
-    def _learn(self, name: str, value: PyTree, version: int) -> None:
+    def _learn(self, name: str, value: object, version: int) -> None:
         if version >= self.oldest_valid:
             self.learned[name] = value
 

@@ -120,7 +120,7 @@ class Session:
         has_family = family == "controller" or hasattr(self.original.loop.plant, family)
         return [AS_GIVEN, *sorted(registry.family_types(family))] if has_family else []
 
-    def put(self, key: str, value: PyTree) -> None:
+    def put(self, key: str, value: object) -> None:
         """Set the number `key` to `value` in its displayed unit; the loop is not checked.
 
         `check_edit` checks the loop and takes some milliseconds. `accept` or `withdraw` must follow it.

@@ -8,7 +8,7 @@ from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `ex
 
 from diffabs.config.values import ScenarioError
 from diffabs.core.pytree import get
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import PyTree
 from diffabs.explore import curves, tuning
 from diffabs.explore.canvas import Canvas
 from diffabs.explore.knobs import unit_words
@@ -111,7 +111,7 @@ class Tuner:
                 ui.button("start", on_click=start).props("unelevated no-caps data-id=start")
         self.dialog.open()
 
-    def _bounds(self, place: Scalar, now: Scenario, paths: list[str], fields: dict[str, Fields]) -> None:
+    def _bounds(self, place: ui.element, now: Scenario, paths: list[str], fields: dict[str, Fields]) -> None:
         """Show fields for the lower and upper bound of each free number."""
         knobs = self.session.knobs
         place.clear()

@@ -45,7 +45,7 @@ class Input(NamedTuple):
     """
 
     measured: PyTree
-    target: Scalar = ()
+    target: Any = ()
 
 
 class State(NamedTuple):
@@ -199,7 +199,7 @@ def _numbers(loop: Loop, typed: Loop, inputs: Input, given_target: bool) -> Iter
     """Yield the parameters that the computer's calculation depends on."""
     measured = inputs.measured
 
-    def ahead(plant: Part) -> Any:
+    def ahead(plant: object) -> Any:
         return typed.feedforward.input(plant, measured, measured[0])
 
     families = ["controller", "feedforward", *(() if given_target else ("reference",))]
@@ -211,7 +211,7 @@ def _numbers(loop: Loop, typed: Loop, inputs: Input, given_target: bool) -> Iter
             yield DeviceParameter(path, np.asarray(value, float), spec)
 
 
-def check_numbers(part: Part, prefix: str = "") -> None:
+def check_numbers(part: object, prefix: str = "") -> None:
     """Check the parameters of a part before their names and values become code."""
     if lines := list(find_problems(part, prefix)):
         raise NotExported("; ".join(lines))
@@ -236,7 +236,7 @@ def _start_input(loop: Loop, target: bool) -> Input:
     return Input(measured, measured[0] if target else ())
 
 
-def _check_reference(loop: Loop, measured: PyTree) -> None:
+def _check_reference(loop: Loop, measured: object) -> None:
     """Raise NotExported for a target that depends on measurements between samples, ticks, or has events."""
     reference, name = loop.reference, type(loop.reference).__name__
     memory = reference.start(measured)
@@ -301,7 +301,7 @@ class _Work:
             target = loop.reference.output(t, reference, measured)
             setpoint = loop.reference.setpoint(reference)
 
-        def ahead(measured: PyTree) -> Any:
+        def ahead(measured: object) -> Any:
             return loop.feedforward.input(loop.plant, measured, setpoint)
 
         # Only measurements that the feed-forward depends on can spoil it. The controller checks the others itself.

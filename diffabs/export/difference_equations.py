@@ -12,7 +12,7 @@ from diffabs.linear.opened_loop import linear_controller
 ENTRY_ROUNDING = 1e-12  # relative to a matrix's largest coefficient; smaller coefficients are rounding errors
 
 
-def difference_equations(loop: Loop, target: Scalar = None) -> JsonObject:
+def difference_equations(loop: Loop, target: Scalar | None = None) -> JsonObject:
     """Return the coefficients of the controller, linearized at rest on the setpoint.
 
     x(k+1) = F x(k) + G y(k) and u(k) = H x(k) + J y(k), all as differences from rest.

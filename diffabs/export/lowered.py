@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel, live_nodes
+from diffabs.compiler.ir import Graph, Node, NodeArray, UpdateLevel, live_nodes
 from diffabs.compiler.lower.labels import Labelled, source_label
 from diffabs.compiler.lower.rules import constant_array, lower_jaxpr
 from diffabs.core.types import PyTree
@@ -109,7 +109,7 @@ def number_leaves(shape: PyTree, graph: Graph, where: str, flat: PyTree) -> dict
     return nodes
 
 
-def fill_shapes(shape: PyTree, nodes: dict[str, Node]) -> list[Array]:
+def fill_shapes(shape: object, nodes: dict[str, Node]) -> list[NodeArray]:
     """Return a pytree's leaves as arrays of nodes, filled in order.
 
     Args:
@@ -124,7 +124,7 @@ def fill_shapes(shape: PyTree, nodes: dict[str, Node]) -> list[Array]:
     return arrays
 
 
-def trace_outputs(graph: Labelled, function: Any, shape: PyTree, inputs: list[Array]) -> list[Node]:
+def trace_outputs(graph: Labelled, function: Any, shape: PyTree, inputs: list[NodeArray]) -> list[Node]:
     """Return the results of a function as one list of nodes, leaf by leaf and entry by entry.
 
     Arrays that the function closes over become constants.

@@ -45,7 +45,7 @@ class Data(Protocol):
         ...
 
 
-def check_sigma_table(sigma: PyTree, of: str) -> None:
+def check_sigma_table(sigma: object, of: str) -> None:
     """Check that standard deviations are given by name: in a mapping, or what behaves as one, like a pandas Series."""
     if not hasattr(sigma, "keys"):
         raise ValueError(f"sigma = {format_value(sigma)} is no mapping from {of} to standard deviations")

@@ -142,7 +142,7 @@ class Identified:
 
 @default_flags()
 def fit(
-    part: Part,
+    part: object,
     free: Sequence[str] | Mapping[str, Range | None],
     residuals: Residuals,
     *,

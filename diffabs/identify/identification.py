@@ -16,7 +16,7 @@ from diffabs.core.bijectors import Range
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import canonical_dtypes, replace
-from diffabs.core.types import Part, Table
+from diffabs.core.types import Table
 from diffabs.core.validity import check_part
 from diffabs.identify.data import Comparison, Data
 from diffabs.identify.fit import Identified, Tolerances, fit
@@ -113,7 +113,7 @@ def identify(
     )
 
 
-def _describe_refusal(loop: Part, comparison: Comparison, solver: Solver) -> str | None:
+def _describe_refusal(loop: object, comparison: Comparison, solver: Solver) -> str | None:
     """Return the reason why the first refused run is not admissible, or None if all runs are."""
     verdicts = (
         batch_admissibility(None, jax.device_get(canonical_dtypes(batch)), solver) for batch in comparison.loops(loop)

@@ -26,7 +26,7 @@ class _GaussianPrior:
 
     paths: tuple[str, ...]
 
-    def __call__(self, means: Vector, deviations: Vector, part: Part) -> Scalar:
+    def __call__(self, means: Vector, deviations: Vector, part: object) -> Scalar:
         """Return (p - mean)/deviation, concatenated over the parameters."""
         terms = zip(self.paths, means, deviations, strict=True)
         return jnp.concatenate([jnp.ravel((get(part, path) - m) / s) for path, m, s in terms])
@@ -75,7 +75,7 @@ def as_partial(prior: Prior | None) -> Prior:
     return prior if isinstance(prior, Partial) else Partial(prior or _empty_prior)
 
 
-def _empty_prior(part: Part) -> Vector:
+def _empty_prior(part: object) -> Vector:
     del part
     return jnp.zeros(0)
 
@@ -89,7 +89,7 @@ class ResidualEvaluation(NamedTuple):
         slopes: Derivatives of both in z, shapes (n, p) and (k, p).
     """
 
-    residuals: Vector
+    residuals: np.ndarray
     prior: Vector
     slopes: tuple[PyTree, PyTree]
 

@@ -11,7 +11,7 @@ import numpy as np
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, get, parameters, replace
-from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.core.types import Part, PyTree, Scalar, Vector
 from diffabs.core.validity import check_part
 from diffabs.identify.data import Comparison, check_positive, check_sigma_table
 from diffabs.objectives import BRAKING
@@ -109,7 +109,7 @@ class _MetricResiduals:
         values = {path: get(part, path) for path in self.shared}
         return [Batch(rows).each(loop, lambda row, key: function(replace(row, values))) for loop, rows in batches]
 
-    def __call__(self, part: Part, batches: Any, place: Scalar, target: Scalar) -> Any:
+    def __call__(self, part: Part, batches: Any, place: Vector, target: Scalar) -> Any:
         def row(loop: Part) -> PyTree:
             metrics = measure(loop, self.solver, dict(self.objectives)).metrics
             return jnp.stack([metrics[name] for name, _ in self.objectives])

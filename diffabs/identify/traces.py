@@ -12,7 +12,7 @@ import numpy as np
 from diffabs.core.loop import Loop
 from diffabs.core.numerics import clamp, ratio
 from diffabs.core.pytree import canonical_dtypes
-from diffabs.core.types import Params, Part, Scalar, Table
+from diffabs.core.types import Matrix, Params, Part, Scalar, Table, Vector
 from diffabs.identify.data import Comparison, check_positive, check_sigma_table
 from diffabs.identify.fit import Identified
 from diffabs.simulate.batch import Batch
@@ -47,7 +47,7 @@ class Traces:
     columns: Table
     sigma: Table | None = None
     over: Params = dataclasses.field(default_factory=dict)
-    until: Scalar = None
+    until: Scalar | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -93,7 +93,7 @@ class Traces:
         whole[np.flatnonzero(self._kept_rows())] = fit.residuals
         return dict(zip(self.columns, whole.reshape(len(self.columns), *self.shape), strict=True))
 
-    def _broadcast_column(self, column: Any) -> np.ndarray:
+    def _broadcast_column(self, column: object) -> np.ndarray:
         return np.broadcast_to(np.asarray(column, float), self.shape).ravel()
 
     def _kept_rows(self) -> np.ndarray:
@@ -172,15 +172,15 @@ class _TraceResiduals:
     solver: Solver
     fields: tuple[str, ...]
 
-    def __call__(self, loop: Part, over: Any, t: Scalar, compared: Any, target: Scalar) -> Any:
+    def __call__(self, loop: object, over: Params, t: Vector, compared: object, target: Scalar) -> Any:
         simulated = Batch(over).each(canonical_dtypes(loop), lambda run_loop, key: self._columns(run_loop, t))
         return jnp.swapaxes(simulated, 0, 1).ravel()[compared] - target
 
-    def _columns(self, loop: Part, t: Scalar) -> Scalar:
+    def _columns(self, loop: Part, t: Vector) -> Matrix:
         """Return the simulated columns of one run at the instants t, shape (columns, n); NaN if the run diverged."""
         run = rollout(loop, self.solver)
         assert run.trajectory is not None
-        times, stride = run.trajectory.sample.t, self.solver.step * self.solver.every
+        times, stride = jnp.asarray(run.trajectory.sample.t), self.solver.step * self.solver.every
         # Kept instants are equally spaced up to the end of the run, so the index needs no search.
         i = jnp.clip(jnp.floor(t / stride).astype(int), 0, len(times) - 2)
         # The last sample repeats after the end of a run. Its zero interval makes `ratio` return 0, not NaN.

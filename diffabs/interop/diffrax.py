@@ -1,12 +1,11 @@
 """Fields of diffrax: the right-hand side of a term for `diffabs.solve`."""
 
 from collections.abc import Callable
-from typing import Any
 
 from diffabs.core.types import PyTree, Scalar
 
 
-def field_of(term: Any) -> Callable[[Scalar, PyTree, PyTree], PyTree]:
+def field_of(term: object) -> Callable[[Scalar, PyTree, PyTree], PyTree]:
     """Return the vector field of a `diffrax.ODETerm`, for `diffabs.solve`.
 
     Args:

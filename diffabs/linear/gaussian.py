@@ -7,7 +7,7 @@ This is the regulator's equation with A', C' in place of A, B, so `dare` solves 
 noise covariance, the closed-loop poles are the eigenvalues of A + B K and of A - A L C.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +18,7 @@ from diffabs.controllers.balance import MEASURED_NAMES, STATE_NAMES
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Plant
 from diffabs.core.renamed import refuse_old_names
-from diffabs.core.types import AnyArray, Bool, Part
+from diffabs.core.types import AnyArray, Bool
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.regulator import dlqr
@@ -79,8 +79,8 @@ def lqg(
     R: AnyArray,
     *,
     period: float = 0.01,
-    disturbance: Part = (1.0, 1.0, 1.0),
-    noise: Any = (1e-3, 1e-3),
+    disturbance: object = (1.0, 1.0, 1.0),
+    noise: object = (1e-3, 1e-3),
     predicted_high: float = np.inf,
 ) -> Sampled:
     """Return a sampled LQG controller for a balancing plant, which measures only theta and psi.

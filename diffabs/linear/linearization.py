@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes
-from diffabs.core.types import AnyArray, Bool, Matrix, PyTree, Scalar
+from diffabs.core.types import AnyArray, Array, Bool, PyTree, Scalar
 from diffabs.plants.wheel import FROZEN_OUTPUTS
 
 # Newton iterations that bring the remaining states to rest; one is enough where their equation is linear.
@@ -42,7 +42,7 @@ class StateSpace(NamedTuple):
 
 
 @default_flags()
-def linearize(plant: Plant, state: PyTree, control: Scalar) -> StateSpace:
+def linearize(plant: Plant, state: object, control: Scalar) -> StateSpace:
     """Return df/dx (n, n) and df/du (n, m) of a plant x' = f(x, u), at a state and a control.
 
     >>> from diffabs import BrakeStart, plants, roads
@@ -68,7 +68,7 @@ def linearize(plant: Plant, state: PyTree, control: Scalar) -> StateSpace:
 
 def tracking_dynamics(
     plant: Plant,
-    state: PyTree,
+    state: object,
     control: Scalar,
     tracked: Sequence[str] = ("slip",),
     frozen: Sequence[str] = FROZEN_OUTPUTS,
@@ -93,7 +93,7 @@ def tracking_dynamics(
 
 def track_outputs(
     plant: Plant,
-    state: PyTree,
+    state: object,
     control: Scalar,
     tracked: Sequence[str] = ("slip",),
     frozen: Sequence[str] = FROZEN_OUTPUTS,
@@ -104,7 +104,7 @@ def track_outputs(
     unravel = ravel_pytree(state)[1]
     remaining = independent_components(plant, state, (*tracked, *frozen))
 
-    def chart(x: Scalar) -> AnyArray:
+    def chart(x: Array) -> Array:
         y = plant.output(unravel(x))
         h, w = ([jnp.ravel(getattr(y, name)) for name in names] for names in (tracked, frozen))
         return jnp.concatenate([*h, x[remaining], *w])
@@ -113,7 +113,7 @@ def track_outputs(
     _check_chart(by_x, (*tracked, *frozen))
 
     # The tangent of the chart along f(x, u) is G(x, u); its Jacobian includes the second derivative of the chart.
-    def moves(x: AnyArray, u: AnyArray) -> AnyArray:
+    def moves(x: Array, u: Array) -> AnyArray:
         return jax.jvp(chart, (x,), (flow(x, u),))[1]
 
     a, b = jax.jacfwd(moves, (0, 1))(x, u)
@@ -153,7 +153,7 @@ def check_kink(subject: str, kinked: Bool) -> None:
         raise ValueError(f"{subject}: a slope jumps here, at a kink: no linear model")
 
 
-def nan_at_kink(model: PyTree, kinked: Bool) -> PyTree:
+def nan_at_kink(model: object, kinked: Bool) -> PyTree:
     """Return a model, or NaN in its place at a kink."""
     return jax.tree.map(lambda x: jnp.where(kinked, jnp.nan, x), model)
 
@@ -163,12 +163,12 @@ def coordinate_moves(by_x: AnyArray, at: AnyArray) -> AnyArray:
     return (jnp.linalg.inv(by_x) * (1 + jnp.abs(at))).T
 
 
-def as_vectors(plant: Plant, state: PyTree, control: Scalar) -> Matrix:
+def as_vectors(plant: Plant, state: object, control: Scalar) -> tuple[Callable[[Array, Array], Array], Array, Array]:
     """Return (flow, x, u): f(x, u) as a function of two vectors, the state as vector x, and the control as vector u."""
     plant, state, control = canonical_dtypes((plant, state, control))
     (x, unravel), (u, unravel_control) = ravel_pytree(state), ravel_pytree(control)
 
-    def flow(x: Scalar, u: Scalar) -> Matrix:
+    def flow(x: Array, u: Array) -> Array:
         return ravel_pytree(plant.derivative(0.0, unravel(x), unravel_control(u)))[0]
 
     return flow, x, u
@@ -187,14 +187,14 @@ def _check_chart(by_x: Any, outputs: Sequence[str]) -> None:
             raise ValueError(f"{named} are no coordinates here: they depend on each other (singular Jacobian)")
 
 
-def independent_components(plant: Plant, state: PyTree, outputs: Sequence[str]) -> np.ndarray:
+def independent_components(plant: Plant, state: object, outputs: Sequence[str]) -> np.ndarray:
     """Return the indices in the flattened state of the components on which none of the outputs depends."""
     used = used_leaves(plant, state, outputs)
     sizes = [np.size(leaf) for leaf in jax.tree.leaves(state)]
     return np.flatnonzero(np.repeat([not u for u in used], sizes))
 
 
-def used_leaves(plant: Plant, state: PyTree, outputs: Sequence[str]) -> list[bool]:
+def used_leaves(plant: Plant, state: object, outputs: Sequence[str]) -> list[bool]:
     """Return for each leaf of the state whether at least one of the outputs depends on it.
 
     Dependence is read from the traced computation, not from values. A leaf counts even if its coefficient is zero, and
@@ -202,7 +202,7 @@ def used_leaves(plant: Plant, state: PyTree, outputs: Sequence[str]) -> list[boo
     """
     leaves, tree = jax.tree.flatten(state)
 
-    def select(*leaves: PyTree) -> Matrix:
+    def select(*leaves: PyTree) -> list[Scalar]:
         y = plant.output(jax.tree.unflatten(tree, leaves))
         return [getattr(y, name) for name in outputs]
 

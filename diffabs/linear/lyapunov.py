@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.types import Matrix, PyTree
+from diffabs.core.types import Array, PyTree
 
 MAX_SMITH_STEPS = 50  # C^(2^50) is 0 for a spectral radius of 1 - 1e-13, and not for a radius of 1
 
@@ -29,12 +29,12 @@ class Lyapunov(NamedTuple):
         residual: Relative residual: the norm of the left side over the sum of the norms of its terms.
     """
 
-    P: Matrix
-    residual: PyTree
+    P: Array
+    residual: Array
 
 
 @default_flags()
-def lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
+def lyapunov(A: Array, Q: Array) -> Lyapunov:
     """Return P of A' P + P A + Q = 0 and its relative residual.
 
     For a stable A, P is the integral of exp(A't) Q exp(At). P is differentiable to any order in both modes; the
@@ -54,7 +54,7 @@ def lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
 
 
 @default_flags()
-def discrete_lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
+def discrete_lyapunov(A: Array, Q: Array) -> Lyapunov:
     """Return P of A' P A - P + Q = 0 and its relative residual.
 
     For a stable A, P is the sum of (A')^k Q A^k. P is differentiable to any order in both modes; the residual counts as
@@ -71,7 +71,7 @@ def discrete_lyapunov(A: Matrix, Q: Matrix) -> Lyapunov:
     return Lyapunov(P, relative_residual(A.T @ P @ A - P + Q, A.T @ P @ A, P, Q))
 
 
-def _solve_vectorised(operator: jax.Array, Q: jax.Array) -> jax.Array:
+def _solve_vectorised(operator: jax.Array, Q: Array) -> jax.Array:
     """Return P of operator vec(P) = -vec(Q), where vec stacks rows."""
     return jnp.linalg.solve(operator, -Q.ravel()).reshape(Q.shape)
 
@@ -83,7 +83,7 @@ def as_float_arrays(*values: PyTree) -> tuple[PyTree, ...]:
     return tuple(jnp.asarray(x, kind) for x in values)
 
 
-def relative_residual(summed: jax.Array, *terms: jax.Array) -> jax.Array:
+def relative_residual(summed: Array, *terms: jax.Array) -> jax.Array:
     """Return the norm of the sum of the terms over the sum of their norms; 0 where all terms are 0.
 
     Its derivative is zero.

@@ -12,6 +12,7 @@ disturbances.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -27,7 +28,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.tracing import depends_on_signal
-from diffabs.core.types import Bool, Matrix, Part, PyTree, Scalar
+from diffabs.core.types import Array, Bool, Part, PyTree, Scalar
 from diffabs.core.validity import check_part
 from diffabs.linear.linearization import check_kink, coordinate_moves, independent_components, is_kinked
 from diffabs.linear.operating_point import MAX_REST_RESIDUE, find_root
@@ -96,7 +97,7 @@ def _check_halves(loop: OpenLoop) -> None:
 
 
 @default_flags()
-def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
+def open_loop(loop: Loop, target: Scalar | None = None) -> OpenLoop:
     """Return a loop, linearised at rest on its setpoint and opened at the controller's command.
 
     Args:
@@ -113,12 +114,12 @@ def open_loop(loop: Loop, target: Scalar = None) -> OpenLoop:
     return _open(loop, target, plant=True)
 
 
-def linear_controller(loop: Loop, target: Scalar = None) -> Transfer:
+def linear_controller(loop: Loop, target: Scalar | None = None) -> Transfer:
     """Return the controller of `open_loop`; the parts around it may be at a kink."""
     return _open(loop, target, plant=False).controller
 
 
-def _open(loop: Loop, target: Scalar, *, plant: bool) -> OpenLoop:
+def _open(loop: Loop, target: Scalar | None, *, plant: bool) -> OpenLoop:
     """Return the open loop. `plant`: whether the parts around the controller must be smooth, too."""
     check_part(loop)
     if target is not None and not np.isfinite(target):
@@ -250,17 +251,17 @@ class _Surroundings:
         )
         self.remaining, self.size, self.held = remaining, size, len(self.frozen)
 
-    def output(self, z: Matrix) -> Matrix:
+    def output(self, z: Array) -> PyTree:
         return self.loop.plant.output(self.unravel(z).plant)
 
-    def signal(self, z: Matrix) -> Tracking:
+    def signal(self, z: Array) -> Tracking:
         measured = self.loop.sensor.output(0.0, Memory(self.unravel(z).sensor, self.memory[0]), self.output(z))
         return Tracking(self.setpoint, measured, self.loop.feedforward.input(self.loop.plant, measured, self.setpoint))
 
-    def signals(self, z: Matrix) -> Matrix:
+    def signals(self, z: Array) -> Array:
         return ravel_pytree(self.signal(z))[0]
 
-    def flow(self, z: Matrix, command: Scalar) -> Matrix:
+    def flow(self, z: Array, command: Scalar) -> Array:
         x = self.unravel(z)
         actuator = Memory(x.actuator, self.memory[1])
         control = self.loop.actuator.output(0.0, actuator, command)
@@ -271,7 +272,7 @@ class _Surroundings:
         )
         return ravel_pytree(rates)[0]
 
-    def chart(self, z: Matrix) -> Matrix:
+    def chart(self, z: Array) -> Array:
         """Return the coordinates."""
         if not self.frozen:
             return z
@@ -279,10 +280,10 @@ class _Surroundings:
         last = jnp.stack([getattr(y, name) for name in self.frozen])
         return jnp.concatenate([y[0][None], z[self.remaining], z[self.size :], last])
 
-    def moves(self, z: Matrix, command: Scalar) -> Matrix:
+    def moves(self, z: Array, command: Scalar) -> Array:
         return jax.jvp(self.chart, (z,), (self.flow(z, command),))[1]
 
-    def rest_residual(self, free: PyTree) -> Matrix:
+    def rest_residual(self, free: PyTree) -> Array:
         """Return a vector that is zero at rest.
 
         It contains the rates of all coordinates except the frozen outputs, and the change of the frozen outputs since
@@ -294,7 +295,9 @@ class _Surroundings:
         return jnp.concatenate([rates, where, (self.output(z)[0] - self.setpoint)[None]])
 
 
-def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: Scalar) -> Matrix:
+def _linearize_controller(
+    loop: Loop, signal: Array, as_signal: Callable[[Array], Tracking], command: Scalar
+) -> tuple[tuple[Array, Array, Array, Array], Callable[[Array, Array], Array], Array]:
     """Return the controller at rest with the command that holds the plant: (A, B, C, D), a function, and its memory.
 
     The system is from its signal to its command. The function maps (signal, memory) to (rate or next memory, command).
@@ -303,7 +306,7 @@ def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: S
     sampled = isinstance(controller, Sampled)
     inside, unravel = ravel_pytree(memory.held.inner if sampled else memory)
 
-    def compute(c: Scalar, s: Scalar) -> tuple[PyTree, PyTree]:
+    def compute(c: Array, s: Array) -> tuple[PyTree, PyTree]:
         """Return the memory after a sample, or its rate in continuous time; and the command."""
         memory, tracking = unravel(c), as_signal(s)
         if not isinstance(controller, Sampled):
@@ -313,12 +316,12 @@ def _linearize_controller(loop: Loop, signal: PyTree, as_signal: Any, command: S
         after, output = controller.compute_sample(clock, memory, tracking)
         return ravel_pytree(after)[0], output
 
-    def rest_residual(c: Scalar, s: Scalar = signal) -> Matrix:
+    def rest_residual(c: Array, s: Array = signal) -> Array:
         """Return a vector that is zero where the memory is at rest and the command holds the plant."""
         after, output = compute(c, s)
         return jnp.append(after - c if sampled else after, output - command)
 
-    def find_rest(offset: Scalar) -> Matrix:
+    def find_rest(offset: Scalar) -> tuple[Array, Array]:
         """Return the memory at rest and the size of the residual; `offset` moves the target for the first step."""
         # At the setpoint itself the command may be at the edge of a limit, where its slope is zero. The first step
         # therefore uses the slopes at a nearby target.

@@ -22,7 +22,7 @@ from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Feedforward, Memory, Plant, Reference, Tracking
 from diffabs.core.pytree import canonical_dtypes, part, pytree, static
-from diffabs.core.types import AnyArray, Bool, Matrix, Part, PyTree, Scalar
+from diffabs.core.types import AnyArray, Array, Bool, Matrix, Part, PyTree, Scalar
 from diffabs.linear.linearization import StateSpace, check_kink, is_kinked, nan_at_kink
 from diffabs.stops import NoStop
 
@@ -165,16 +165,16 @@ class _VectorLoop(NamedTuple):
     setpoint: Scalar
     unravel: Any
 
-    def track(self, z: AnyArray) -> tuple[PyTree, Tracking]:
+    def track(self, z: Array) -> tuple[PyTree, Tracking]:
         loop, x = self.loop, self.unravel(z)
         y = loop.plant.output(x.plant)
         measured = loop.sensor.output(0.0, Memory(x.sensor), y)
         return y, Tracking(self.setpoint, measured, loop.feedforward.input(loop.plant, measured, self.setpoint))
 
-    def command(self, z: AnyArray) -> AnyArray:
+    def command(self, z: Array) -> AnyArray:
         return self.loop.controller.output(0.0, Memory(self.unravel(z).controller), self.track(z)[1])
 
-    def flow(self, z: AnyArray, v: Scalar) -> AnyArray:
+    def flow(self, z: Array, v: Scalar) -> AnyArray:
         loop, x = self.loop, self.unravel(z)
         y, signal = self.track(z)
         rates = _IntegratedStates(
@@ -204,7 +204,7 @@ def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     free = find_root(still, jnp.append(z[~inside], 0.0))
     z = z.at[~inside].set(free[:-1])
 
-    def rest_residual(memory: PyTree, z: Matrix = z) -> Matrix:
+    def rest_residual(memory: object, z: Array = z) -> Matrix:
         """Return the rates of the controller's memory, and its command minus that which holds the plant."""
         moved = z.at[inside].set(memory)
         return jnp.append(vectors.flow(moved, free[-1])[inside], vectors.command(moved) - free[-1])
@@ -225,7 +225,7 @@ def _smooth_model(model: OperatingPoint) -> LinearLoop:
     return linear
 
 
-def find_root(function: Any, x: Scalar) -> AnyArray:
+def find_root(function: Any, x: Array) -> Any:
     """Return a root (n,) of a vector function by the Gauss-Newton method, without one the least-squares minimiser.
 
     The result is differentiable twice in the parameters of the function.

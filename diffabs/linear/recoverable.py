@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.types import AnyArray, PyTree, Scalar
+from diffabs.core.types import AnyArray, Scalar
 from diffabs.linear.riccati import care
 
 UNIT_SWEEPS = 30  # over the states, for their units; enough where these differ by 1e12
@@ -27,7 +27,7 @@ ROUNDING = 1e-12  # products below this, relative to the norms of their factors,
 
 
 @default_flags()
-def recoverable_bound(A: AnyArray, B: AnyArray, start: PyTree, limit: Scalar) -> AnyArray:
+def recoverable_bound(A: AnyArray, B: AnyArray, start: object, limit: Scalar) -> AnyArray:
     """Return the largest multiple of `start` from which some |u| <= limit returns, for a system with one unstable pole.
 
     The result is a scalar, differentiable in all arguments. It is NaN if A has poles on the imaginary axis. With
@@ -44,7 +44,7 @@ def recoverable_bound(A: AnyArray, B: AnyArray, start: PyTree, limit: Scalar) ->
     return 2 * limit / jnp.sqrt((b @ p @ b) * (d @ p @ d))
 
 
-def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[float, float]:
+def mode_bounds(A: AnyArray, B: AnyArray, start: object, limit: float) -> dict[float, float]:
     """Return {pole: multiple} over the unstable real poles [1/s], the largest recoverable multiple of `start` for each.
 
     Some |u| <= limit returns the mode from every smaller multiple, and none from a larger one. Each mode is taken
@@ -76,7 +76,7 @@ def mode_bounds(A: AnyArray, B: AnyArray, start: PyTree, limit: float) -> dict[f
     return multiples
 
 
-def transmission_zeros(A: AnyArray, B: AnyArray, output: PyTree) -> np.ndarray:
+def transmission_zeros(A: AnyArray, B: AnyArray, output: object) -> np.ndarray:
     """Return the finite invariant zeros of x' = A x + B u, y = c'x, shape (n - r,) for relative degree r.
 
     They are the transmission zeros, and the modes that u does not move or y does not show. At a zero the Rosenbrock

@@ -16,7 +16,7 @@ from jax.core import Tracer
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.types import AnyArray, Bool, Matrix, PyTree
+from diffabs.core.types import AnyArray, Bool, PyTree
 from diffabs.linear.riccati import care, dare, symmetric_part
 from diffabs.linear.stabilisability import unstabilisable_mode
 from diffabs.linear.weights import as_weight_matrix, check_symmetric
@@ -114,21 +114,21 @@ def dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
-def _solve_lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -> Regulator:
+def _solve_lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None) -> Regulator:
     riccati = care(A, B, Q, R, S)
     turned = jnp.asarray(B).T @ riccati.P + (0.0 if S is None else jnp.asarray(S).T)
     return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R, riccati.P.dtype)), turned), *riccati)
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
-def _solve_dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -> Regulator:
+def _solve_dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None) -> Regulator:
     riccati = dare(A, B, Q, R, S)
     b = jnp.asarray(B)
     turned = b.T @ riccati.P @ jnp.asarray(A) + (0.0 if S is None else jnp.asarray(S).T)
     return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R)) + b.T @ riccati.P @ b, turned), *riccati)
 
 
-def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix, *, discrete: bool) -> None:
+def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None, *, discrete: bool) -> None:
     """Raise ValueError for matrices of numbers that have no regulator; accept traced ones."""
     if any(isinstance(x, Tracer) for x in (A, B, Q, R)):
         return

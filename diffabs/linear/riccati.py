@@ -23,7 +23,7 @@ import jax.numpy as jnp
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.types import AnyArray, Bool, Matrix, PyTree
+from diffabs.core.types import Any, AnyArray, Array, Bool, Matrix, PyTree
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.lyapunov import discrete_lyapunov as _discrete_lyapunov
 from diffabs.linear.lyapunov import lyapunov as _lyapunov
@@ -136,7 +136,7 @@ def symmetric_part(X: AnyArray) -> AnyArray:
     return (X + X.T) / 2
 
 
-def _riccati(solution: Callable, A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Matrix) -> Riccati:
+def _riccati(solution: Callable, A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Any) -> Riccati:
     A, B, Q, R = as_float_arrays(A, B, Q, R)
     S = jnp.zeros_like(B) if S is None else as_float_arrays(S)[0].astype(B.dtype)
     if jnp.iscomplexobj(B) or jnp.iscomplexobj(S):
@@ -174,11 +174,11 @@ def _solve_discrete(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 @_solve_continuous.defjvp
-def _solve_continuous_jvp(data: PyTree, tangents: PyTree) -> Matrix:
+def _solve_continuous_jvp(data: PyTree, tangents: PyTree) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Solve Ac' dP + dP Ac + (derivative of the left side at constant P) = 0 for the tangent dP."""
     P, residual = _solve_continuous(*data)
 
-    def left_side(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -> Matrix:
+    def left_side(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: AnyArray) -> Matrix:
         PA, T = P @ A, P @ B + S
         return PA + PA.T - T @ jnp.linalg.solve(R, T.T) + Q
 
@@ -188,11 +188,11 @@ def _solve_continuous_jvp(data: PyTree, tangents: PyTree) -> Matrix:
 
 
 @_solve_discrete.defjvp
-def _solve_discrete_jvp(data: PyTree, tangents: PyTree) -> Matrix:
+def _solve_discrete_jvp(data: PyTree, tangents: PyTree) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Solve Ac' dP Ac - dP + (derivative of the left side at constant P) = 0 for the tangent dP."""
     P, residual = _solve_discrete(*data)
 
-    def left_side(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -> Matrix:
+    def left_side(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: AnyArray) -> Matrix:
         T = A.T @ P @ B + S
         return A.T @ P @ A - T @ jnp.linalg.solve(R + B.T @ P @ B, T.T) + Q
 

@@ -5,17 +5,16 @@ batch). Nested `vmap` calls join their axes into one batch. `riccati` states the
 contains its steps.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial, reduce
 from operator import add
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from diffabs.core.types import Matrix, PyTree, Scalar
+from diffabs.core.types import Any, Array, PyTree, Scalar
 from diffabs.linear.lyapunov import (
     cholesky,
     eye,
@@ -46,7 +45,7 @@ def _batch_over_matrices(solver: Callable) -> Callable:
     """Return `solver` for arrays (batch, rows, columns), in chunks of CHUNK_MATRICES; vmap enlarges the batch."""
 
     @custom_vmap
-    def many(*data: jax.Array) -> Matrix:
+    def many(*data: jax.Array) -> tuple[Array, Array]:
         lanes = len(data[0])
         width = min(CHUNK_MATRICES, max(lanes, 1))
         # The padding repeats the last equation. Zeros have no solution, and would start the fallback for the chunk.
@@ -58,7 +57,9 @@ def _batch_over_matrices(solver: Callable) -> Callable:
         return P.reshape(-1, *P.shape[2:])[:lanes], residual.ravel()[:lanes]
 
     @many.def_vmap
-    def rule(axis_size: int, batched: Any, *data: jax.Array) -> Matrix:
+    def rule(
+        axis_size: int, batched: Sequence[bool], *data: jax.Array
+    ) -> tuple[tuple[Array, Array], tuple[bool, bool]]:
         full = [x if b else jnp.broadcast_to(x, (axis_size, *x.shape)) for x, b in zip(data, batched, strict=True)]
         P, residual = many(*(x.reshape(-1, *x.shape[2:]) for x in full))
         lanes = full[0].shape[:2]
@@ -68,7 +69,7 @@ def _batch_over_matrices(solver: Callable) -> Callable:
 
 
 @_batch_over_matrices
-def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Matrix:
+def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> tuple[Array, Array]:
     """Return (P, residual) of continuous equations, shapes (batch, n, n) and (batch,); P is NaN where it is not proven.
 
     R is symmetric positive definite.
@@ -86,7 +87,7 @@ def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
 
 
 @_batch_over_matrices
-def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Matrix:
+def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> tuple[Array, Array]:
     """Return (P, residual) of discrete equations, shapes (batch, n, n) and (batch,); P is NaN where it is not proven.
 
     R is symmetric positive semidefinite, and singular only if R + B' P B > 0.
@@ -124,7 +125,7 @@ def _blocks(*blocks: jax.Array) -> jax.Array:
 # Steps 1 and 2
 
 
-def _reduce_and_balance(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -> Matrix:
+def _reduce_and_balance(A: Array, B: Array, Q: Array, R: Array, S: Array) -> tuple[Array, ...]:
     """Return B L^-T and S L^-T, the balanced equation with R = I and S = 0, and scales d of the state.
 
     L is the Cholesky factor, L L' = R. The balanced matrices are those of A - B R^-1 S', B L^-T and Q - S R^-1 S'.
@@ -136,7 +137,7 @@ def _reduce_and_balance(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -
     return B, S, a * d / d[:, None], B / d[:, None], q * d * d[:, None], d
 
 
-def _shift_weights(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix, definite: jax.Array) -> tuple[PyTree, ...]:
+def _shift_weights(A: Array, B: Array, Q: Array, R: Array, S: Array, definite: jax.Array) -> tuple[Array, ...]:
     """Return Q, R, S of the discrete equation for P - shift, and the diagonal matrix `shift`.
 
     The shift is 0 where R is definite, and NaN where R is not semidefinite. In balanced coordinates it is as large as
@@ -201,7 +202,7 @@ def _solve_by_doubling(A: jax.Array, G: jax.Array, Q: jax.Array) -> tuple[jax.Ar
         k, A, _, _ = carry
         return (k < MAX_DOUBLINGS) & jnp.any(frobenius_norm(A) > 1e-5)  # the error of Q is its square
 
-    def double(carry: PyTree) -> Matrix:
+    def double(carry: PyTree) -> tuple[Array, ...]:
         k, A, G, Q = carry
         W = gauss_jordan_solve(eye(n, A) + times(G, Q), jnp.concatenate([A, G], 1))[0]
         T = transpose(A)
@@ -224,7 +225,7 @@ def _sign(Z: jax.Array) -> jax.Array:
         k, _, moved = carry
         return (k < MAX_SIGN_ITERATIONS) & jnp.any(moved > 1e-5)  # converges quadratically
 
-    def step(carry: PyTree) -> Matrix:
+    def step(carry: PyTree) -> tuple[Array, ...]:
         k, Z, _ = carry
         inverse, log = gauss_jordan_solve(Z, eye(len(Z), Z))
         c = jnp.exp(-log / len(Z))
@@ -251,7 +252,7 @@ def _refine_and_prove(newton: Callable, P: jax.Array, shift: Scalar = 0.0) -> ja
     def goes_on(carry: PyTree) -> jax.Array:
         return ~carry[0]
 
-    def step(carry: PyTree) -> Matrix:
+    def step(carry: PyTree) -> tuple[Array, ...]:
         _, k, P, moved, *_ = carry
         last = (k >= MAX_KLEINMAN_STEPS) | ~jnp.any(moved > 1e-7)
         # Only the last step needs X. A second copy of the step for it would take as long to compile.
@@ -281,13 +282,13 @@ def _unscale_with_residual(P: jax.Array, d: jax.Array, terms: Callable) -> tuple
     return jnp.where(residual <= MAX_RELATIVE_RESIDUAL, P, jnp.nan), residual
 
 
-def _terms(A: Matrix, B: Matrix, Q: Matrix, S: Matrix, P: Matrix) -> tuple[PyTree, ...]:
+def _terms(A: Array, B: Array, Q: Array, S: Array, P: Array) -> tuple[Array, ...]:
     """Return the terms of the continuous equation with R = I."""
     PA, T = times(P, A), times(P, B) + S
     return PA, transpose(PA), -times(T, transpose(T)), Q
 
 
-def _discrete_terms(A: Matrix, B: Matrix, Q: Matrix, S: Matrix, P: Matrix) -> tuple[PyTree, ...]:
+def _discrete_terms(A: Array, B: Array, Q: Array, S: Array, P: Array) -> tuple[Array, ...]:
     """Return the terms of the discrete equation with R = I."""
     PA, PB = times(P, A), times(P, B)
     T = times(transpose(B), PA) + transpose(S)
@@ -295,7 +296,7 @@ def _discrete_terms(A: Matrix, B: Matrix, Q: Matrix, S: Matrix, P: Matrix) -> tu
     return times(transpose(A), PA), -P, -times(transpose(T), gain), Q
 
 
-def _kleinman(A: Matrix, B: Matrix, Q: Matrix, scale: Scalar, P: Matrix, *extra: Scalar) -> tuple[PyTree, ...]:
+def _kleinman(A: Array, B: Array, Q: Array, scale: Any, P: Array, *extra: Array) -> tuple[Any, ...]:
     """Return the size of the terms, the Newton step D, and one X for each E of `extra`.
 
         Ac' D + D Ac + (left side at P) = 0,     Ac' X + X Ac + E = 0
@@ -310,7 +311,7 @@ def _kleinman(A: Matrix, B: Matrix, Q: Matrix, scale: Scalar, P: Matrix, *extra:
     return sum(map(frobenius_norm, terms)), *solve_stein(I + 2 * scale * M, *right)
 
 
-def _hewer(A: Matrix, B: Matrix, Q: Matrix, P: Matrix, *extra: Scalar) -> tuple[PyTree, ...]:
+def _hewer(A: Array, B: Array, Q: Array, P: Array, *extra: Array) -> tuple[Any, ...]:
     """Return the size of the terms, the Newton step D, and one X for each E of `extra`, in discrete time.
 
     Ac' D Ac - D + (left side at P) = 0,     Ac' X Ac - X + E = 0

@@ -72,7 +72,7 @@ class Band(NamedTuple):
 
 
 @default_flags()
-def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, target: Scalar = None) -> Band:
+def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, target: Scalar | None = None) -> Band:
     """Return the margins of a loop over a box {path: (low, high)}: at its corners, and at samples that fill it evenly.
 
     Equal corners count once, so a range with low = high adds none. If low = high in all ranges, there are no samples.

@@ -18,9 +18,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.types import Matrix, Scalar
+from diffabs.core.types import Any
 from diffabs.linear.delay_steps import LEAST_DISTANCE, REACHING, DelayedLoop
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.transfer import Transfer, check_transfer
@@ -348,7 +349,7 @@ def _refine_grid(system: Transfer, w: np.ndarray) -> np.ndarray:
     return w
 
 
-def _response(system: Transfer, w: Scalar) -> Matrix:
+def _response(system: Transfer, w: ArrayLike) -> Any:
     return system.response(w)[:, 0, 0]
 
 

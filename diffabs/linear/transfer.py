@@ -8,11 +8,13 @@ Matrices are NumPy arrays. The delay is exact: its response is e^(-j w delay), w
 
 import contextlib
 import math
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 
-from diffabs.core.types import Matrix, Part, Scalar
+from diffabs.core.types import Any, Matrix
 
 WHOLE_PERIOD_TOLERANCE = 1e-9  # of a period: how far from whole periods the delay of a sampled system may be
 
@@ -29,10 +31,10 @@ class Transfer(NamedTuple):
         delay: Pure delay [s], at least 0, a whole number of periods for a sampled system.
     """
 
-    A: Matrix
-    B: Matrix
-    C: Matrix
-    D: Matrix
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
     period: float | None = None
     delay: float = 0.0
 
@@ -41,7 +43,7 @@ class Transfer(NamedTuple):
         """Poles (n,) of the rational part: in s, or in z if sampled."""
         return np.linalg.eigvals(self.A) if len(self.A) else np.zeros(0)
 
-    def rational_response(self, w: Scalar) -> np.ndarray:
+    def rational_response(self, w: ArrayLike) -> Any:
         """Return the response (k, p, m) at frequencies w (k,) [rad/s], without the delay; infinite at a pole."""
         w = np.atleast_1d(np.asarray(w, float))
         # z - A = (z - 1) - (A - 1) keeps the digits of slow modes, whose z is near 1.
@@ -51,7 +53,7 @@ class Transfer(NamedTuple):
         with np.errstate(all="ignore"):
             return self.C @ _solve_or_infinite(shifted, np.asarray(self.B, complex)) + self.D
 
-    def response(self, w: Scalar) -> np.ndarray:
+    def response(self, w: ArrayLike) -> Any:
         """Return the response (k, p, m) at frequencies w (k,) [rad/s]."""
         return self.rational_response(w) * np.exp(-1j * np.atleast_1d(np.asarray(w, float)) * self.delay)[:, None, None]
 
@@ -146,7 +148,7 @@ def to_control(system: Transfer, *, pade: int | None = None) -> Matrix:
         ModuleNotFoundError: python-control is not installed.
         ValueError: The system has a delay in continuous time and `pade` is None.
     """
-    control: Scalar = _import_control()
+    control = _import_control()
     if system.period is None and system.delay:
         if pade is None:
             raise ValueError(
@@ -160,7 +162,7 @@ def to_control(system: Transfer, *, pade: int | None = None) -> Matrix:
     )
 
 
-def from_control(system: Part) -> Transfer:
+def from_control(system: object) -> Transfer:
     """Return the `Transfer` of a python-control `StateSpace` or `TransferFunction`.
 
     Args:
@@ -170,7 +172,7 @@ def from_control(system: Part) -> Transfer:
         ModuleNotFoundError: python-control is not installed.
         ValueError: The system is sampled with an unknown period (dt=True).
     """
-    control: Scalar = _import_control()
+    control = _import_control()
     model = control.ss(system)
     if model.dt is True:
         raise ValueError("dt is True: the system is sampled, but nothing says how often; give it a period [s]")
@@ -178,7 +180,7 @@ def from_control(system: Part) -> Transfer:
     return Transfer(*matrices, period=float(model.dt) if model.dt else None)
 
 
-def _import_control() -> Matrix:
+def _import_control() -> ModuleType:
     try:
         import control
     except ModuleNotFoundError as error:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.types import AnyArray, Scalar
+from diffabs.core.types import AnyArray, Array, Scalar
 from diffabs.linear.linearization import StateSpace
 
 TERMS, EXPONENTIAL_SQUARINGS = 14, 16  # terms of the Taylor series and largest number of squarings of e^a
@@ -45,7 +45,7 @@ def hold_input(a: np.ndarray, b: np.ndarray, times: np.ndarray) -> tuple[np.ndar
     return exponential[:, :n, :n], exponential[:, :n, n:]
 
 
-def _exponential(a: Scalar) -> AnyArray:
+def _exponential(a: Array) -> AnyArray:
     """Return e^a by scaling and squaring of its Taylor series.
 
     It is exact to about rounding for norms up to 2^(EXPONENTIAL_SQUARINGS - 1). `jax.scipy.linalg.expm` hangs for

@@ -1,6 +1,7 @@
 """Objectives of a balance: fall, time to rest, and peaks of angles, voltage and torque."""
 
 import math
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -8,14 +9,14 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp, larger, later_of_larger, sign
 from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import param, pytree
-from diffabs.core.types import Part, PyTree, Scalar, Vector
+from diffabs.core.types import PyTree, Scalar, Vector
 from diffabs.objectives.tracking import FinalValue, HeldValue, Integral
 
 RATE_NAMES = ("theta_rate", "psi_rate", "phi_rate")
 ANGLE_NAMES = ("theta", "psi", "phi")
 
 
-def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Scalar:
+def _norm(output: BalanceOutput, weights: Sequence[float] | Vector = (1.0,) * 6) -> Scalar:
     """Return |x| weighted by `weights`, with slope 0 at x = 0."""
     square = sum(w * getattr(output, name) ** 2 for w, name in zip(weights, ANGLE_NAMES + RATE_NAMES, strict=True))
     # Two selects: the square root has an infinite slope at 0, and 0 * inf in the branch not taken would be NaN.
@@ -55,11 +56,11 @@ class FinalNorm(FinalValue):
 def _greatest_angle(name: str) -> tuple[PyTree, PyTree]:
     """Return start and update of the greatest |angle|, from the cubic of every step."""
 
-    def start(self: Part, sample: Sample) -> Memory:
+    def start(self: object, sample: Sample) -> Memory:
         del self
         return Memory(held=jnp.abs(getattr(sample.output, name)))
 
-    def update(self: Part, memory: Memory, segment: Segment) -> Scalar:
+    def update(self: object, memory: Memory, segment: Segment) -> Scalar:
         del self
         angle = segment.output(lambda output: getattr(output, name))
         # `falls` refers to |angle|, so a negative angle is mirrored.
@@ -89,18 +90,18 @@ class PeakArmAngle(HeldValue):
     start, update = _greatest_angle("psi")
 
 
-def _greatest_size(size: Scalar) -> tuple[PyTree, PyTree]:
+def _greatest_size(size: Callable[[Sample], Scalar]) -> tuple[PyTree, PyTree]:
     """Return start and update of the greatest size(sample).
 
     The search covers both ends of every step. It covers the inside only of a smooth step, in which no limit is reached.
     Otherwise the cubic may leave the limits.
     """
 
-    def start(self: Part, sample: Sample) -> Memory:
+    def start(self: object, sample: Sample) -> Memory:
         del self
         return Memory(held=size(sample))
 
-    def update(self: Part, memory: Memory, segment: Segment) -> Scalar:
+    def update(self: object, memory: Memory, segment: Segment) -> Scalar:
         del self
         ends, falls = later_of_larger(size(segment.start), size(segment.end)), False
         if segment.smooth is not False:

@@ -30,7 +30,7 @@ class FinalValue:
         del sample
         return Memory()
 
-    def flow(self, memory: Memory, sample: Sample) -> Scalar:
+    def flow(self, memory: Memory, sample: Sample) -> PyTree:
         """Return (): there is no integral."""
         del memory, sample
         return ()
@@ -348,7 +348,7 @@ class QuadraticCost(Integral):
         """Return the memory with both integrals 0."""
         return Memory(flow=Quadratic(*(0.0 * sample.output[0],) * 2))
 
-    def flow(self, memory: Memory, sample: Sample) -> Quadratic:
+    def flow(self, memory: Memory, sample: Sample) -> PyTree:
         """Return e and the integrand of the cost."""
         x1, x2, u = memory.flow.error, tracking_error(sample), sample.control - sample.feedforward
         return Quadratic(x2, self.q[0] * x1**2 + self.q[1] * x2**2 + self.r * u**2)

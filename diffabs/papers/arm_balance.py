@@ -9,7 +9,7 @@ hanging arm. An independent solution gives the numbers for comparison.
 import dataclasses
 import pathlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -19,7 +19,7 @@ from diffabs.controllers import BalanceFeedback
 from diffabs.core.loop import Loop
 from diffabs.core.numerics import spectral_bound
 from diffabs.core.pytree import replace
-from diffabs.core.types import JsonObject, Matrix, Part, PyTree, Table
+from diffabs.core.types import AnyArray, JsonObject, Part, PyTree, Table
 from diffabs.design.attraction import Basin, Cells, Reach, largest_recovered_multiples, region_of_attraction
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.linearization import StateSpace
@@ -107,7 +107,7 @@ def lqr_gain(plant: Part, weights: PyTree = (1.0,) * 6, effort: float = 1.0) -> 
     return np.asarray(lqr(*upright_model(plant), np.diag(weights), effort * np.eye(1)).gain[0])
 
 
-def loop(plant: Part, gain: Matrix, start: PyTree = PAPER_START, voltage: float = 48.0) -> Loop:
+def loop(plant: Any, gain: Sequence[float] | AnyArray, start: PyTree = PAPER_START, voltage: float = 48.0) -> Loop:
     """Return the closed loop from a start.
 
     Args:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.types import AnyArray, JsonObject, Scalar
+from diffabs.core.types import AnyArray, JsonObject, Scalar, Vector
 from diffabs.papers import record
 from diffabs.plants import ArmBalance
 
@@ -16,7 +16,7 @@ from diffabs.plants import ArmBalance
 RODS = {"body": "body_height", "arm": "arm_length", "rider": "rider_height"}
 
 
-def potentials(p: ArmBalance, q: AnyArray) -> Scalar:
+def potentials(p: ArmBalance, q: Vector) -> Scalar:
     """Return eqs. (2), (4), (6) as printed, shape (3,) [J].
 
     In (4) and (6) a term lacks the factor g, so that they add kg m to J.
@@ -31,7 +31,7 @@ def potentials(p: ArmBalance, q: AnyArray) -> Scalar:
     return jnp.stack([u1, u2, u3])
 
 
-def printed_equations(p: ArmBalance, q: AnyArray, v: Scalar, a: Scalar) -> Scalar:
+def printed_equations(p: ArmBalance, q: Vector, v: AnyArray, a: Vector) -> Scalar:
     """Return the left sides of eqs. (8), (9), (10), shape (3,).
 
     Args:

@@ -19,7 +19,7 @@ def figures(
     over_riders: Mapping[str, tuple[PyTree, list[Reach]]],
     limit: np.ndarray,
     start: np.ndarray,
-    hanging: Any,
+    hanging: object,
 ) -> JsonObject:
     """Return the figures by file name.
 
@@ -51,7 +51,7 @@ def _claim(runs: Mapping[str, Run]) -> Any:
         assert trajectory is not None
         plot.draw_angle_lines(ax, trajectory)
         plot.label_axes(ax, "time [s]", "angle [rad]", title, legend=i == 0)
-        ax.set_xlim(0, 6.0 if i == 0 else float(trajectory.sample.t[-1]) * 1.05)
+        ax.set_xlim(0, 6.0 if i == 0 else float(np.asarray(trajectory.sample.t)[-1]) * 1.05)
     return figure
 
 

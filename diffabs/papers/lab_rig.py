@@ -311,7 +311,7 @@ def build_step(curves: StepCurves, rig: LabRig) -> Loop:
     )  # fmt: skip
 
 
-def _rims(run: Run, speed: Vector) -> tuple[Vector, Vector, Vector]:
+def _rims(run: Run, speed: float) -> tuple[Any, Any, Any]:
     """Return time [s] and the rim speeds of wheel and drum as fractions of the first speed."""
     assert run.trajectory is not None
     sample = run.trajectory.sample

@@ -4,11 +4,13 @@ published gain.
 The paper models a car of a tonne by 5 kg.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
 
 from diffabs.core.numerics import spectral_bound
-from diffabs.core.types import AnyArray, JsonObject, Matrix
+from diffabs.core.types import AnyArray, JsonObject
 from diffabs.design import Polytope
 from diffabs.papers import record
 from diffabs.papers.lmi_design import DESIGN_BOX, K1, PUBLISHED_GAIN
@@ -46,7 +48,7 @@ def corner(system: Polytope, mass: float, speed: float) -> tuple[np.ndarray, np.
     return np.asarray(system.A[i]), np.asarray(system.B[i])
 
 
-def cost(A: np.ndarray, B: np.ndarray, gain: Matrix, weights: tuple[float, float]) -> float:
+def cost(A: np.ndarray, B: np.ndarray, gain: Sequence[float] | AnyArray, weights: tuple[float, float]) -> float:
     """Return the trace of the cost matrix P, eq. (24), with R = 1; infinity if the gain does not stabilise.
 
     Args:

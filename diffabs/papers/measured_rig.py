@@ -26,7 +26,7 @@ from diffabs.config.values import ScenarioError
 from diffabs.controllers import ConstantTorque, PlayedCommand, Relay, Sampled
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import param, part, pytree, replace
-from diffabs.core.types import JsonObject, Params, Part, Scalar, Vector
+from diffabs.core.types import JsonObject, Params, Scalar, Vector
 from diffabs.identify import Identified, Tolerances, fit
 from diffabs.plants import BrakeStart, LabRig
 from diffabs.references import FixedSlip
@@ -351,7 +351,7 @@ def compare_with_maker() -> list[JsonObject]:
     curves = read_curves()
     start = DrivenStart(speed=180 * MASK.drum_radius, slip=1 - MASK.wheel_radius / MASK.drum_radius)
 
-    def run_of(controller: Part, name: str, end: float) -> tuple[Callable[[str], np.ndarray], JsonObject]:
+    def run_of(controller: object, name: str, end: float) -> tuple[Callable[[str], np.ndarray], JsonObject]:
         loop = braking(plant=MASK, initial=start, controller=controller, stop=Standstill(speed=0.05),
                        reference=FixedSlip(slip=0.7 if name.endswith("0.7") else 0.1))  # fmt: skip
         run = simulate(loop, FixedStep(step=RUN_STEP, duration=end))

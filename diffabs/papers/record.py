@@ -38,7 +38,7 @@ def computed_row(
     return {**line, "published": published, "reference": reference, "difference": difference}
 
 
-def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float, digits: int = 2) -> JsonObject:
+def printed_row(name: str, quantity: str, unit: str, ours: object, published: float, digits: int = 2) -> JsonObject:
     """Return the row of `computed_row` with "matches": whether ours and the published number round alike.
 
     Args:

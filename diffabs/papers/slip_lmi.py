@@ -17,7 +17,7 @@ import numpy as np
 from diffabs import plot
 from diffabs.controllers import HoldingInput, StateFeedback
 from diffabs.core.loop import Loop
-from diffabs.core.types import JsonObject, Part, Table
+from diffabs.core.types import JsonObject, Table
 from diffabs.objectives import BRAKING
 from diffabs.papers import lmi_claims, lmi_design, record
 from diffabs.papers.digest import Digest, digest
@@ -118,7 +118,7 @@ NOTES = [
 ]
 
 
-def loop(case: Case, reference: Part = None) -> Loop:
+def loop(case: Case, reference: object = None) -> Loop:
     """Return the closed loop of section 5."""
     return braking(
         plant=MirroredRig(mass=case.mass, inertia_factor=case.inertia_factor),

@@ -34,7 +34,7 @@ from diffabs.controllers import BalanceFeedback
 from diffabs.core.numerics import clamp, quotient
 from diffabs.core.protocols import BalanceOutput
 from diffabs.core.pytree import param, pytree
-from diffabs.core.types import AnyArray, Part, PyTree, Scalar
+from diffabs.core.types import AnyArray, PyTree, Scalar
 from diffabs.objectives import BALANCE
 from diffabs.plants.audit import BalanceAudit
 from diffabs.references import Upright
@@ -83,14 +83,14 @@ class BalanceStart:
     """Rate of phi at t = 0."""
 
 
-def usual_parts(self: Part) -> dict[str, PyTree]:
+def usual_parts(self: object) -> dict[str, PyTree]:
     """Return the default parts of a loop by field: feedback that holds the vehicle upright until it falls."""
     del self
     around = {"reference": Upright(), "controller": BalanceFeedback(), "actuator": VoltageLimit(), "stop": Fallen()}
     return {"initial": BalanceStart(), **around}
 
 
-def usual_objectives(self: Part) -> dict[str, PyTree]:
+def usual_objectives(self: object) -> dict[str, PyTree]:
     """Return the default objectives of a two-wheeler, by name."""
     del self
     return dict(BALANCE)
@@ -262,7 +262,7 @@ class ArmBalance:
         current[..., 4] -= self.gear * self.back_emf / self.resistance
         return (current / np.asarray(self.current_max)[..., None])[..., None, :]
 
-    def remainder(self, linear: Any, extent: Callable[[PyTree], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def remainder(self, linear: object, extent: Callable[[PyTree], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return D (..., 6, 3) and the bound Y (..., 3) of the nonlinear remainder D y, |y| <= Y.
 
         The equations are x' = linear x + D y. The bound holds wherever |row x| <= extent(row) for all rows. If all

@@ -222,7 +222,7 @@ def draw_speeds(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
     figure, axes = sheet(1, len(runs), title=title, size=(5.2 if len(runs) > 1 else 6.4, 3.6), sharex=True, sharey=True)
     for i, (ax, (name, trajectory)) in enumerate(zip(axes, runs.items(), strict=True)):
         _speeds(ax, trajectory)
-        words = f"{name}: ends at {float(trajectory.sample.t[-1]):.2f} s" if name else ""
+        words = f"{name}: ends at {float(np.asarray(trajectory.sample.t)[-1]):.2f} s" if name else ""
         label_axes(ax, "time [s]", "" if i else "speed [km/h]", words)
         ax.set_xlim(0, None)
     # The automatic end below 0 keeps the line of a locked wheel off the axis.

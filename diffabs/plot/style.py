@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import PyTree
 from diffabs.runtime import files
 
 try:
@@ -119,7 +119,7 @@ def make_logarithmic(ax: Axes, axis: str) -> None:
 class _Decades(LogLocator):
     """A locator of decades, with 2 and 5 of each over less than two decades."""
 
-    def tick_values(self, vmin: float, vmax: float) -> Scalar:
+    def tick_values(self, vmin: float, vmax: float) -> np.ndarray:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return the places of the labels between `vmin` and `vmax`."""
         decades = np.log10(vmax / vmin) if vmin > 0 else np.inf
         self.set_params(subs=(1.0, 2.0, 5.0) if decades < FEW_DECADES else (1.0,))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.core.types import Scalar, Table
+from diffabs.core.types import Table
 from diffabs.plot.style import (
     COLOURS,
     GREY,
@@ -18,6 +18,7 @@ from diffabs.plot.style import (
     Figure,
     ListedColormap,
     Patch,
+    Sheet,
     label_axes,
     make_logarithmic,
     save_figure,
@@ -260,7 +261,9 @@ def _limits(ax: Axes, low: float, high: float, bound: float | None) -> tuple[flo
     return low - 0.03 * width, high + 0.03 * width
 
 
-def _panels(names: Sequence[str], title: str, size: tuple[float, float] = (5.0, 3.1), **kwargs: Any) -> Scalar:
+def _panels(
+    names: Sequence[str], title: str, size: tuple[float, float] = (5.0, 3.1), **kwargs: Any
+) -> tuple[Sheet | None, list[Any]]:
     """Return a figure and one axes for each name, or None and no axes without names."""
     if not names:
         return None, []

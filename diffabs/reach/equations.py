@@ -17,7 +17,7 @@ and only with the slip as a state does an enclosure keep that. `check_slip_chart
 import dataclasses
 import math
 import random
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import DTypeLike
 
-from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel, live_nodes
+from diffabs.compiler.ir import Graph, Node, NodeArray, UpdateLevel, live_nodes
 from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxpr, scalar_array
 from diffabs.controllers.sampled import Sampled
 from diffabs.core.blocks import offers
@@ -35,7 +35,7 @@ from diffabs.core.loop import BLOCKS, Loop, LoopState
 from diffabs.core.messages import Clock
 from diffabs.core.protocols import BrakeOutput
 from diffabs.core.pytree import parameters, replace
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Int, PyTree, Scalar
 from diffabs.core.validity import check_part
 from diffabs.plants import BrakeStart
 
@@ -218,7 +218,7 @@ def _simplify(graph: RealGraph, name: str, args: tuple[Node, ...]) -> Node | Non
     return None
 
 
-def tick_clock(loop_period: float, t: Scalar, h: Scalar, k: Scalar) -> Clock:
+def tick_clock(loop_period: float, t: Scalar, h: Scalar, k: Int) -> Clock:
     """Return the clock at a tick of every block, whose number is k; a block of another period has no rule."""
 
     class Tick(Clock):
@@ -295,7 +295,7 @@ class _Derivation:
         shapes = [[jax.ShapeDtypeStruct((), node.dtype) for node in group] for group in (self.parameter_nodes, *groups)]
         closed = jax.make_jaxpr(call)([jax.ShapeDtypeStruct(x.shape, x.dtype) for x in fixed], *shapes)
         constants = [constant_array(self.graph, np.asarray(x)) for x in closed.consts]
-        inputs: list[Array] = [constant_array(self.graph, x) for x in fixed]
+        inputs: list[NodeArray] = [constant_array(self.graph, x) for x in fixed]
         inputs += [scalar_array(node) for group in (self.parameter_nodes, *groups) for node in group]
         try:
             return [x for array in lower_jaxpr(self.graph, closed.jaxpr, constants, inputs) for x in array.flat]
@@ -323,7 +323,7 @@ class _Derivation:
                 at += size
             return jax.tree.unflatten(structure, leaves)
 
-        def flat(tree: PyTree) -> list[Any]:
+        def flat(tree: object) -> list[Any]:
             return [jnp.asarray(x, float) for leaf in jax.tree.leaves(tree) for x in jnp.ravel(leaf)]
 
         begun = self.lower(lambda loop: flat(start(loop)))
@@ -387,19 +387,19 @@ class _Derivation:
         h and k are the step of the integration grid and the number of the tick.
         """
 
-        def rates(loop: Loop, state: PyTree, t: Scalar) -> PyTree:
+        def rates(loop: Loop, state: object, t: Scalar) -> PyTree:
             whole = self.loop_state(loop, state)
             flow = loop.flow(t, whole, loop.signals(t, whole))
             return jax.tree.map(jnp.zeros_like, whole).with_flow(flow)
 
         period = self.period or 0.0
 
-        def after(loop: Loop, state: PyTree, t: Scalar, h: Scalar, k: Scalar) -> PyTree:
+        def after(loop: Loop, state: PyTree, t: Scalar, h: Scalar, k: Int) -> PyTree:
             whole = self.loop_state(loop, state)
             clock = tick_clock(period, t, h, k)
             return loop.change(clock, whole, loop.signals(t, whole), {}, {}, None)._replace(plant=state.plant)
 
-        def show(loop: Loop, state: PyTree, t: Scalar) -> PyTree:
+        def show(loop: Loop, state: object, t: Scalar) -> Sequence[Scalar]:
             whole = self.loop_state(loop, state)
             sample = loop.signals(t, whole).sample
             return [
@@ -454,7 +454,7 @@ class _Derivation:
                 replacements[original.id] = self.graph.again(original, args) if args else original
         return replacements[node.id]
 
-    def make(self, name: str, args: tuple[int, ...], value: Any = None) -> int:
+    def make(self, name: str, args: tuple[int, ...], value: object = None) -> int:
         """Return the index of an operation, which is added if it is new."""
         key = (name, args, value)
         if key not in self.indices:
@@ -657,9 +657,9 @@ class _Derivation:
 class _Chart(NamedTuple):
     """The states of a braked wheel in a proof: slip [1], speed [m/s], distance [m]."""
 
-    slip: Scalar
-    speed: Scalar
-    distance: Scalar
+    slip: Node
+    speed: Node
+    distance: Node
 
 
 def _power_of(node: Node) -> tuple[Node, Node] | None:
@@ -720,7 +720,7 @@ def _clock_of(loop: Loop) -> float | None:
     return next(iter(periods), None)
 
 
-def _is_traced(path: PyTree, leaf: np.ndarray) -> bool:
+def _is_traced(path: object, leaf: np.ndarray) -> bool:
     """Return whether a number of the loop is an input of its programs. Periods and delays of blocks are not."""
     words = _text(path).split(".")
     return np.asarray(leaf).dtype.kind == "f" and not (words[0] in BLOCKS and words[-1] in ("period", "delay"))
@@ -790,7 +790,7 @@ def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
     graph, paths = RealGraph(), [path for path in over if path.startswith("plant.")]
     inputs = [graph.input(np.float64, UpdateLevel.STEP, (STATE, i)) for i in range(3 + len(paths))]
 
-    def show(speed: Scalar, slip: Scalar, distance: Scalar, *values: Scalar) -> Scalar:
+    def show(speed: Scalar, slip: Scalar, distance: Scalar, *values: Scalar) -> Sequence[Scalar]:
         plant = replace(loop, dict(zip(paths, values, strict=True))).plant
         y = plant.output(plant.start(BrakeStart(speed=speed, slip=slip))._replace(distance=distance))
         return y.slip, y.speed, y.wheel_speed

@@ -213,7 +213,7 @@ def _open_pair(pair: Any) -> tuple[float | None, float | None]:
     return None if low is None else _number(low), None if high is None else _number(high)
 
 
-def _number(number: Any) -> float:
+def _number(number: object) -> float:
     if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
         raise ValueError(f"{number!r} is not a finite number")
     return float(number)

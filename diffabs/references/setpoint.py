@@ -2,7 +2,7 @@
 
 from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_memory
 from diffabs.core.pytree import param, pytree
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Scalar
 
 
 @pytree
@@ -15,7 +15,7 @@ class Setpoint:
     start = no_memory
     flow = no_flow
 
-    def output(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
+    def output(self, t: Scalar, memory: Memory, signal: object) -> Scalar:
         """Return the target, in the unit of that signal."""
         del t, memory, signal
         return self.value

@@ -273,7 +273,7 @@ def _make_plan(dimension: int, threshold: float, samples: int, share: float, lev
     return _Plan(float(threshold), samples, chains, levels, draws)
 
 
-def _check_integer(name: str, value: PyTree, minimum: int) -> None:
+def _check_integer(name: str, value: object, minimum: int) -> None:
     if not isinstance(value, int | np.integer) or isinstance(value, bool):
         raise ValueError(f"{name} = {format_value(value)} is no integer; an integer in [{minimum}, inf) is needed")
     if value < minimum:

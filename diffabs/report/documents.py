@@ -6,7 +6,7 @@ import os
 import pathlib
 import sys
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from diffabs.config.values import format_given
 from diffabs.core.types import JsonObject
@@ -109,7 +109,7 @@ def _read_integer(text: str) -> int:
     return value
 
 
-def _inside(content: Any, path: pathlib.Path) -> Iterator[Document]:
+def _inside(content: object, path: pathlib.Path) -> Iterator[Document]:
     """Yield a document, or the documents of all papers in the output of `reproduce --json`."""
     if not isinstance(content, dict):
         return

@@ -1,7 +1,6 @@
 """Designs, certificates with their claims, and proofs over a box as sections of a report."""
 
 import shlex
-from typing import Any
 
 from diffabs.core.types import Table
 from diffabs.design.verify import verify_file
@@ -77,7 +76,7 @@ def proof_verdicts(proof: Table) -> list[ReportVerdict]:
     return verdicts
 
 
-def _verify_command(path: Any) -> str:
+def _verify_command(path: object) -> str:
     """Return the command that verifies a file; a document may give the file a name that looks like an option."""
     path = f"./{path}" if str(path).startswith("-") else str(path)
     return shlex.join(["diffabs", "verify", path])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp, ratio
 from diffabs.core.protocols import Road
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Any, PyTree, Scalar
 
 GRID = 1024  # intervals of (0, 1]: resolves the peak of every road with a peak slip above 0.001
 BISECTIONS = 50  # 2^-50 of an interval is below the resolution of float64
@@ -43,14 +43,14 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
         distance: Place on the road [m].
     """
 
-    def mu(s: Scalar) -> Scalar:
+    def mu(s: Scalar) -> Any:
         return road.friction(s, speed, distance)
 
     def slope(s: Scalar) -> Scalar:
         return jax.jvp(mu, (s,), (jnp.ones_like(s),))[1]
 
     grid = jnp.linspace(0.0, 1.0, GRID + 1)
-    values = jax.lax.stop_gradient(jax.vmap(mu)(grid))
+    values: jax.Array = jax.lax.stop_gradient(jax.vmap(mu)(grid))
     falls = (values[1:] < values[:-1]) & (values[:-1] > 0)  # a fitted curve may dip below 0 next to slip 0
     inside = jnp.any(falls)
     # A comparison with NaN is false, so a curve of NaN seems never to fall. At slip 0 a formula may be 0/0.

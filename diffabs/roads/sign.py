@@ -8,7 +8,7 @@ from jax.tree_util import Partial
 
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once
 from diffabs.core.rules import Rule
-from diffabs.core.types import Part, Scalar
+from diffabs.core.types import AnyArray, Part, Scalar
 
 SPEED = 10.0  # m/s, at which the sign of a road's friction is checked
 MAX_FRICTION_AT_REST = 1e-6  # |mu| at slip 0, more than rounding
@@ -42,7 +42,7 @@ def stays_below(friction: Partial, limit: Scalar, name: str, then: str) -> Rule:
     return Rule((mu < limit).all(), f"friction is not below {name} at some slip: {then}", says)
 
 
-def find_wrong_sign(road: Part) -> str:
+def find_wrong_sign(road: object) -> str:
     """Return a line about the first slip at which friction has the opposite sign or is NaN; empty without such a slip.
 
     20 slips from 0.05 to 1, their negatives and 0 are checked, at 10 m/s and distance 0.
@@ -62,7 +62,7 @@ def _friction_of(road: Part, slip: Scalar) -> Scalar:
     return road.friction(slip, SPEED, 0.0)
 
 
-def _at_slips(friction: Partial) -> Scalar:
+def _at_slips(friction: Partial) -> AnyArray:
     """Return mu at SLIPS in the active precision, as a NumPy array unless traced."""
     mu = _along(friction, SLIPS.astype(jnp.result_type(float)))
     return mu if isinstance(mu, Tracer) else np.asarray(mu)

@@ -19,7 +19,7 @@ from diffabs.core.arrays import as_rule_array
 from diffabs.core.numerics import odd, ratio, searchsorted
 from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import Rule, increase_rule
-from diffabs.core.types import Scalar, Vector
+from diffabs.core.types import Array, Matrix, Scalar, Vector
 
 KNOTS = (  # slip and friction at the knots of the identified spline
     (0, 0.02108, 0.04215, 0.06323, 0.08431, 0.09696, 0.10539, 0.12039, 0.14539,
@@ -90,7 +90,7 @@ class PiecewiseCubic:
 
     knots: Vector = param(unit="1")
     """Knots x_i, shape (n,)."""
-    rows: Vector = param(unit="1")
+    rows: Matrix = param(unit="1")
     """Rows (x_i, c0, c1, c2, c3), shape (n - 1, 5)."""
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
@@ -107,7 +107,7 @@ class PiecewiseCubic:
         return c0 + z * (c1 + z * (c2 + z * c3))
 
 
-def slopes(x: Scalar, y: Scalar) -> Scalar:
+def slopes(x: Array, y: Array) -> Array:
     """Return the slopes dy/dx (n,) at n >= 3 knots: inside, the weighted harmonic mean of the two neighbouring secants.
 
     The slope is 0 where these secants differ in sign. At both ends it is a limited three-point slope. At a local
@@ -122,7 +122,7 @@ def slopes(x: Scalar, y: Scalar) -> Scalar:
     return jnp.concatenate([first[None], inner, last[None]])
 
 
-def _end_slope(h0: Scalar, h1: Scalar, m0: Scalar, m1: Scalar) -> Scalar:
+def _end_slope(h0: Scalar, h1: Scalar, m0: Scalar, m1: Scalar) -> Array:
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
     steep = (jnp.sign(m0) != jnp.sign(m1)) & (jnp.abs(d) > 3 * jnp.abs(m0))
     return jnp.where(jnp.sign(d) != jnp.sign(m0), 0.0, jnp.where(steep, 3 * m0, d))

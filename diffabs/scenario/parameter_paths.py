@@ -36,7 +36,7 @@ from diffabs.config.values import (
 )
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters
-from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
+from diffabs.core.types import JsonObject, PyTree, Table
 from diffabs.scenario.registry import KMH, MAX_DEPTH, in_kmh
 from diffabs.scenario.toml import parse_value
 
@@ -111,7 +111,7 @@ class ParameterEntry:
             )
         return tuple(scale_to_si(end, self.scale) for end in ends)
 
-    def _end(self, value: PyTree, path: str) -> Scalar:
+    def _end(self, value: object, path: str) -> float | tuple[float, ...]:
         """Return one end of a range: a number, or a tuple with as many numbers as the parameter."""
         if not self.shape or not isinstance(value, list):
             return read_number(value, self.spec, path)
@@ -121,7 +121,7 @@ class ParameterEntry:
         return tuple(read_number(item, self.spec, f"{path}.{i}") for i, item in enumerate(value))
 
 
-def interval_ends(value: PyTree, where: str) -> list[PyTree] | None:
+def interval_ends(value: object, where: str) -> list[PyTree] | None:
     """Return the ends of an interval `{ low, high }` or "low:high" as given, or None for a value of another form."""
     if isinstance(value, str) and value.count(":") == 1:
         ends = [parse_value(text.strip()) for text in value.split(":")]
@@ -133,12 +133,12 @@ def interval_ends(value: PyTree, where: str) -> list[PyTree] | None:
     return [value[key] for key in INTERVAL_KEYS]
 
 
-def interval_table(low: Scalar, high: Scalar) -> JsonObject:
+def interval_table(low: float | tuple, high: float | tuple) -> JsonObject:
     """Return an interval as a TOML value; its ends are numbers or tuples."""
     return dict(zip(INTERVAL_KEYS, as_plain((low, high)), strict=True))
 
 
-def scale_to_si(value: Scalar, scale: float) -> Scalar:
+def scale_to_si(value: Any, scale: float) -> Any:
     """Return a number, or a tuple of numbers, in SI.
 
     Args:
@@ -253,7 +253,7 @@ def read_entries(
         yield ParameterEntry(path, _where(section, key), value, spec, shape, scale)
 
 
-def parameters_of(loop: Part) -> dict[str, tuple[ParameterSpec, tuple[int, ...]]]:
+def parameters_of(loop: object) -> dict[str, tuple[ParameterSpec, tuple[int, ...]]]:
     """Return spec and shape of every parameter by path."""
     return {path: (spec, np.shape(value)) for path, spec, value in parameters(loop)}
 

@@ -150,7 +150,7 @@ def _packaged_parts(family: str) -> Table:
     return parts
 
 
-def name_of(family: str, part: Part) -> str:
+def name_of(family: str, part: object) -> str:
     """Return the name of a part in scenarios: that of a named constant, else that of the part's class."""
     named = (name for name, item in family_types(family).items() if item is part)
     return next(named, kebab_case(type(part).__name__))
@@ -164,12 +164,12 @@ def family_of(field: str, enclosing: str) -> str:
     return next((name for name in (field, field.removesuffix("s")) if name in FAMILIES), enclosing)
 
 
-def type_name(section: PyTree) -> Scalar:
+def type_name(section: PyTree) -> str | None:
     """Return the name of the type in a section: the section itself if it is a bare word, else its `type`, or None."""
     return section.get("type") if isinstance(section, dict) else section
 
 
-def describe_missing_inner_parts(family: str, section: PyTree, path: str) -> list[str]:
+def describe_missing_inner_parts(family: str, section: object, path: str) -> list[str]:
     """Return a line for each enclosed part of the same family whose type the table does not give.
 
     Such a part would get the default type of the enclosing class, whatever the scenario has there. A named constant
@@ -194,17 +194,17 @@ def describe_missing_inner_parts(family: str, section: PyTree, path: str) -> lis
     return lines
 
 
-def part_summary(part: Part) -> str:
+def part_summary(part: object) -> str:
     """Return the first paragraph of a part's docstring, on one line."""
     return " ".join((inspect.getdoc(type(part)) or "").split("\n\n")[0].split())
 
 
-def unit_of(objective: Any, plant: Part = None) -> str:
+def unit_of(objective: object, plant: object = None) -> str:
     """Return the unit of an objective's value; empty if the objective declares none. Signals are those of the plant."""
     return resolve_unit(getattr(objective, "unit", ""), units_of(plant) or DEFAULT_UNITS)
 
 
-def build_part(family: str, section: PyTree, default: Any, path: str, units: Units | None = None) -> PyTree:
+def build_part(family: str, section: object, default: object, path: str, units: Units | None = None) -> PyTree:
     """Return the part that a table, or the bare name of a type, describes.
 
     A type selects its own default fields; a table without `type` changes fields of `default`. Ranges of numbers are
@@ -325,7 +325,7 @@ def _whole_range(field: dataclasses.Field[Any], value: Scalar) -> tuple[int, int
     return (1 if default >= 1 else -MAX_STATIC), MAX_STATIC
 
 
-def _numbers(value: PyTree, depth: int, spec: ParameterSpec, path: str) -> Any:
+def _numbers(value: object, depth: int, spec: ParameterSpec, path: str) -> Any:
     """Return a number (`depth` 0), or the array of lists that are nested `depth` deep."""
     if not depth:
         return read_number(value, spec, path)
@@ -338,7 +338,7 @@ def _numbers(value: PyTree, depth: int, spec: ParameterSpec, path: str) -> Any:
 
 
 def _parts(
-    family: str, value: PyTree, default: tuple[PyTree, ...], path: str, units: Units | None
+    family: str, value: object, default: tuple[PyTree, ...], path: str, units: Units | None
 ) -> tuple[PyTree, ...]:
     """Return a tuple of parts from a list, or from a table that changes default parts by number or adds the next."""
     if isinstance(value, list) and value:

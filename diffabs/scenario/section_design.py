@@ -33,7 +33,7 @@ from diffabs.controllers import Sampled
 from diffabs.core.blocks import Series
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, parameters
-from diffabs.core.types import JsonObject, Matrix, Part, PyTree, Scalar
+from diffabs.core.types import JsonObject, Matrix, Scalar
 from diffabs.linear.slip_model import SlipModel
 from diffabs.scenario.parameter_paths import canonical_path, interval_table, read_entries
 
@@ -42,7 +42,7 @@ ENTRY = ParameterSpec("1")
 Range = tuple[float, float]
 
 
-def _weight(weight: PyTree, path: str) -> Scalar:
+def _weight(weight: object, path: str) -> Scalar:
     """Return a weight as a number or nested tuples, which can be compared.
 
     The size is not checked here: only the linear model has the order.
@@ -66,7 +66,7 @@ def _weight(weight: PyTree, path: str) -> Scalar:
     return value
 
 
-def _numbers(value: PyTree, path: str) -> Any:
+def _numbers(value: object, path: str) -> Any:
     if not isinstance(value, list):
         return read_number(value, ENTRY, path)
     return tuple(_numbers(item, f"{path}.{i}") for i, item in enumerate(value))
@@ -135,7 +135,7 @@ class _Parameter:
     shape: tuple[int, ...] = ()
 
 
-def read_design_section(table: PyTree, loop: Loop) -> DesignTask:
+def read_design_section(table: object, loop: Loop) -> DesignTask:
     """Return the task that a section describes."""
     task: DesignTask = read_table(DesignTask, table, "design", over=lambda value, path: _over(value, path, loop))
     for present, missing in (("Q", "R"), ("R", "Q")):
@@ -144,7 +144,7 @@ def read_design_section(table: PyTree, loop: Loop) -> DesignTask:
     return task
 
 
-def _over(value: PyTree, path: str, loop: Loop) -> dict[str, Range]:
+def _over(value: object, path: str, loop: Loop) -> dict[str, Range]:
     table = table_reader(read_as_given, "ranges")(value, path)
     allowed = {name: (parameter.spec, parameter.shape) for name, parameter in _rangeable_parameters(loop).items()}
     entries = read_entries(table, path, allowed, "not a parameter of this loop's linear model")
@@ -176,5 +176,5 @@ def _rangeable_parameters(loop: Loop) -> dict[str, _Parameter]:
     return rangeable
 
 
-def _parameter(part: Part, prefix: str, name: str, model: str) -> dict[str, _Parameter]:
+def _parameter(part: object, prefix: str, name: str, model: str) -> dict[str, _Parameter]:
     return {path: _Parameter(model, spec) for path, spec, _ in parameters(part, prefix) if path == prefix + name}

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from diffabs.config.values import plain_fields, range_reader, read_one, read_switch, table_field, whole_reader
 from diffabs.core.pytree import ParameterSpec
-from diffabs.core.types import JsonObject, PyTree
+from diffabs.core.types import JsonObject
 from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.types import SOLVER_TYPES, Adaptive, FixedStep, Solver
 
@@ -43,7 +43,7 @@ class _Adaptive(_Any):
 SECTIONS = {"fixed": _Fixed, "adaptive": _Adaptive}
 
 
-def read_solver_section(table: PyTree) -> tuple[Solver, int]:
+def read_solver_section(table: object) -> tuple[Solver, int]:
     """Return solver and seed of a section."""
     if isinstance(table, Mapping):
         fixed = {"step", "kinks"} & table.keys() and "rtol" not in table

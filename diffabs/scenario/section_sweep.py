@@ -115,7 +115,7 @@ class SweepSection:
         return plain_fields(dataclasses.replace(self, over={}, correlation=None)) | short
 
 
-def _format_item(item: Any) -> PyTree:
+def _format_item(item: object) -> PyTree:
     """Return a distribution, or a choice of parts, as a TOML value."""
     if isinstance(item, distributions.Uniform):
         return interval_table(item.low, item.high)
@@ -123,7 +123,7 @@ def _format_item(item: Any) -> PyTree:
 
 
 def read_sweep_section(
-    table: PyTree, loop: Loop, objectives: Mapping[str, Objective], folder: pathlib.Path
+    table: object, loop: Loop, objectives: Mapping[str, Objective], folder: pathlib.Path
 ) -> SweepSection:
     """Return the sweep that a section describes.
 
@@ -216,7 +216,7 @@ def _choice(key: str, value: PyTree, default: Any) -> Choice:
     if not isinstance(table, dict) or not isinstance(table.get("choices"), list) or not table["choices"]:
         raise wrong_kind_error(where, value, "a list of parts, or a table of choices and weights,")
     names = [item if isinstance(item, str) else f"{i}" for i, item in enumerate(table["choices"])]
-    drawn = distributions.read_distribution({**table, "type": "categorical", "choices": names}, where)
+    drawn: Any = distributions.read_distribution({**table, "type": "categorical", "choices": names}, where)
     family, parts = family_of(key, key), {}
     for i, (name, item) in enumerate(zip(names, table["choices"], strict=True)):
         if lines := describe_missing_inner_parts(family, item, f"{where}.{i}"):

@@ -43,7 +43,7 @@ from diffabs.config.values import read_table as read_table
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters
-from diffabs.core.types import JsonObject, PyTree, Table
+from diffabs.core.types import JsonObject, Table
 from diffabs.scenario.parameter_paths import (
     Ends,
     ParameterEntry,
@@ -62,7 +62,7 @@ DECLARED_RANGE = "declared"
 MOST_LANES = 100_000
 
 
-def _aggregate(value: PyTree, path: str) -> JsonObject:
+def _aggregate(value: object, path: str) -> JsonObject:
     """Return type and fields of an aggregate."""
     part = read_one(risk.AGGREGATE_TYPES, value, path)
     return {
@@ -144,7 +144,7 @@ class Goal:
         return read_one(risk.AGGREGATE_TYPES, self.aggregate, "tune.aggregate")
 
 
-def read_tune_section(table: PyTree, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:
+def read_tune_section(table: object, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:
     """Return the goal that a section describes, of at most `MOST_LANES` combinations."""
     samples = table.get("samples") if isinstance(table, Mapping) else 0
     goal: Goal = read_table(

@@ -5,7 +5,7 @@ import re
 import tomllib
 
 from diffabs.config.values import ScenarioError, format_given
-from diffabs.core.types import JsonObject, PyTree, Scalar
+from diffabs.core.types import JsonObject, PyTree
 
 MOST_LEVELS = 50  # of nested tables and lists; a scenario has fewer than 5
 MAX_INTEGER = 2**63  # bound of whole numbers: TOML has 64 bits
@@ -61,7 +61,7 @@ def _has_long_key(text: str) -> bool:
     return False
 
 
-def parse_value(text: str) -> Scalar:
+def parse_value(text: str) -> object:
     """Return the value that a text on the command line stands for.
 
     A TOML value is read as such, `1,2` is a list of numbers, and any other text is itself.
@@ -87,7 +87,7 @@ def write_toml(top: JsonObject, sections: dict[str, JsonObject]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _write_value(value: Scalar) -> str:
+def _write_value(value: object) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, list):

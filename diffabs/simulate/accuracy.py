@@ -24,7 +24,7 @@ from diffabs.core.blocks import offers
 from diffabs.core.loop import BLOCKS, Loop
 from diffabs.core.protocols import Clock, Memory, Objective
 from diffabs.core.pytree import refine_parts
-from diffabs.core.types import Bool, Int, Key, Part, PyTree, Scalar
+from diffabs.core.types import Bool, Int, Key, Part, PyTree, Scalar, Vector
 from diffabs.simulate.run import measure
 from diffabs.simulate.types import Run, Solver, refine_solver
 
@@ -148,7 +148,7 @@ def needs_key(loop: Loop) -> bool:
     return False
 
 
-def _has_same_noise(loop: Loop, solver: Solver, divisors: tuple[int, ...], key: PyTree) -> Bool:
+def _has_same_noise(loop: Loop, solver: Solver, divisors: tuple[int, ...], key: object) -> Bool:
     """Return True if the sensor shows the same values at the common instants with the steps of all `divisors`.
 
     The plant's signal is held constant, so only noise can differ. At most `MAX_COMPARED_INSTANTS` instants are
@@ -161,7 +161,7 @@ def _has_same_noise(loop: Loop, solver: Solver, divisors: tuple[int, ...], key: 
     # All steps share one scan: a program for each would take as long to compile as a run.
     outputs = jax.vmap(lambda h: _draws(loop, h, count * max(divisors), key))(steps)
 
-    def agree(x: Scalar) -> Bool:
+    def agree(x: Vector) -> Bool:
         coarse = x[0, :count]
         finer = jnp.stack([x[i, : count * times : times] for i, times in enumerate(divisors, 1)])
         return jnp.all((coarse == finer) | (jnp.abs(coarse - finer) <= 1e-6 * jnp.abs(coarse)))  # infinities are equal

@@ -174,7 +174,7 @@ def was_step_checked(loop: Loop, solver: Solver) -> bool:
     return isinstance(solver, Adaptive) or (jax.tree.structure(loop), float(solver.step)) in _stable_steps
 
 
-def batch_admissibility(loop: Loop | None, values: PyTree, solver: Solver) -> Admissibility:
+def batch_admissibility(loop: Loop | None, values: object, solver: Solver) -> Admissibility:
     """Make the checks of `check` for each run of a batch, and return a code for each run instead of an error.
 
     One compiled program checks all runs. A code stands for the first check that a run fails. Without a common loop,
@@ -198,7 +198,7 @@ def batch_admissibility(loop: Loop | None, values: PyTree, solver: Solver) -> Ad
     return _name_reasons(loop, values, step, codes)
 
 
-def _name_reasons(loop: Loop | None, values: PyTree, step: float, codes: np.ndarray) -> Admissibility:
+def _name_reasons(loop: Loop | None, values: object, step: float, codes: np.ndarray) -> Admissibility:
     """Return the codes renumbered to the reasons that occur; code -1 is an unstable step."""
     present = [code for code in np.unique(codes).tolist() if code] if codes.any() else []
     named = {-1: f"solver.step = {step:g} s is not stable"}
@@ -243,10 +243,10 @@ def _rules(loop: Loop, step: float) -> Iterator[Rule]:
 
 
 @partial(jax.jit, static_argnames="step")
-def _codes(loop: Loop | None, values: PyTree, *, step: float) -> Scalar:
+def _codes(loop: Loop | None, values: object, *, step: float) -> Scalar:
     """Return the number of the first broken rule of each run, from 1, shape (runs,); 0 if no rule is broken."""
 
-    def code(values: PyTree) -> Any:
+    def code(values: object) -> Any:
         holds = jnp.stack([jnp.asarray(rule.holds) for rule in _rules(canonical_dtypes(_lane(loop, values)), step)])
         return jnp.where(jnp.all(holds), 0, 1 + jnp.argmin(holds))  # argmin finds the first False
 

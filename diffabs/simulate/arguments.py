@@ -125,7 +125,7 @@ _warn_unchecked_step = functools.cache(
 )
 
 
-def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: PyTree) -> None:
+def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: object) -> None:
     """Raise a ValueError if an objective of a run would have a wrong derivative.
 
     It is that of a `Variation` behind a pure delay with adaptive steps.

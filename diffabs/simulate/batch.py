@@ -128,7 +128,7 @@ class Batch:
         members = [np.flatnonzero(classes == i) for i in np.unique(classes)]
         return [(lanes, float(durations[lanes].max())) for lanes in members]
 
-    def lane(self, loop: Part, i: int) -> PyTree:
+    def lane(self, loop: object, i: int) -> PyTree:
         """Return the loop of run `i`, given the common `loop`."""
         return replace(loop, {path: np.asarray(column)[i] for path, column in self.values.items()})
 

@@ -23,7 +23,6 @@ from diffabs.core.blocks import offers
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Ending, Memory, Objective, Sample, Tracking, resting_segment
 from diffabs.core.pytree import canonical_dtypes, stack_lists
-from diffabs.core.types import Part, PyTree
 
 STEP = 1e-3  # [s] arbitrary: only its type matters
 # folders whose code is not the user's: this package, Python's library, and installed packages such as JAX
@@ -109,7 +108,7 @@ def _follow_loop(loop: Loop) -> tuple[Sample, Ending]:
     return sample, Ending(sample, stopped, *remainder)
 
 
-def _follow_block(name: str, block: Part, signal: PyTree, *, is_real: bool = False) -> Any:
+def _follow_block(name: str, block: object, signal: object, *, is_real: bool = False) -> Any:
     """Call each method of a block once, and return its output, which has to be one real number if `is_real`."""
     t = jnp.asarray(0.0)
     memory = _call(name, block, "start", signal)
@@ -141,7 +140,7 @@ def _follow_objective(path: str, objective: Objective, sample: Sample, ending: E
     _expect_reals(f"{path}.value", _call(path, objective, "value", memory, ending))
 
 
-def _call(path: str, part: Part, method: str, *args: Any) -> Any:
+def _call(path: str, part: object, method: str, *args: Any) -> Any:
     """Return the result of a method, or raise a Misfit with the reason why it fails.
 
     A ValueError of a packaged part is its message to the user, and is raised again unchanged.
@@ -168,7 +167,7 @@ def _call(path: str, part: Part, method: str, *args: Any) -> Any:
         raise Misfit(f"{path}.{method}{why}{place}") from error
 
 
-def _explain_missing(path: str, part: Part, method: str, error: AttributeError) -> str:
+def _explain_missing(path: str, part: object, method: str, error: AttributeError) -> str:
     """Return a line about a missing attribute: which part reads it, and which fields exist."""
     frames = [frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__)]
     reader = ([frame_self for frame_self in frames if dataclasses.is_dataclass(frame_self)] or [part])[-1]
@@ -190,7 +189,7 @@ def _place(error: Exception) -> str:
     return f" ({pathlib.Path(user_frames[-1].filename).name}, line {user_frames[-1].lineno})" if user_frames else ""
 
 
-def _check_shown(plant: Part, output: PyTree) -> None:
+def _check_shown(plant: object, output: object) -> None:
     """Check a plant's output, its declared type `shows`, the units of `shows`, and `control_unit`."""
     _expect_reals("plant.output", output)
     unit, shows = getattr(plant, "control_unit", ""), getattr(plant, "shows", None)
@@ -207,7 +206,7 @@ def _check_shown(plant: Part, output: PyTree) -> None:
         raise Misfit(f"plant.output returns {_describe(output)}; {shows.__name__}(...) is needed, as plant.shows says")
 
 
-def _expect_memory(path: str, memory: Any) -> None:
+def _expect_memory(path: str, memory: object) -> None:
     if not isinstance(memory, Memory):
         raise Misfit(f"{path} returns {_describe(memory)}; Memory(flow, held) is needed")
     _expect_reals(f"{path}, in flow,", memory.flow)
@@ -215,17 +214,17 @@ def _expect_memory(path: str, memory: Any) -> None:
         raise Misfit(f"{path}, in held, returns {_describe(memory.held)}; numbers or arrays are needed")
 
 
-def _expect_real(path: str, value: Any) -> None:
+def _expect_real(path: str, value: object) -> None:
     if _describe(value) != "float":
         raise Misfit(f"{path} returns {_describe(value)}; one real number is needed, a float without axes")
 
 
-def _expect_reals(path: str, tree: PyTree) -> None:
+def _expect_reals(path: str, tree: object) -> None:
     if tree is None or any(not _describe_leaf(leaf).startswith("float") for leaf in jax.tree.leaves(tree)):
         raise Misfit(f"{path} returns {_describe(tree)}; real numbers are needed, of type float")
 
 
-def _expect_like(path: str, tree: PyTree, like: PyTree, name: str) -> None:
+def _expect_like(path: str, tree: object, like: object, name: str) -> None:
     """Check that a result has structure, shapes and kinds of numbers of `like`; `name` stands for it in the message."""
     fits = jax.tree.structure(tree) == jax.tree.structure(like)
     if not fits or list(map(_describe_leaf, jax.tree.leaves(tree))) != list(map(_describe_leaf, jax.tree.leaves(like))):
@@ -238,12 +237,12 @@ class _Word(str):
     __repr__ = str.__str__
 
 
-def _describe(tree: PyTree) -> str:
+def _describe(tree: object) -> str:
     """Return the text of a result, with kind and shape in place of each number."""
     return repr(jax.tree.map(lambda leaf: _Word(_describe_leaf(leaf)), tree))
 
 
-def _describe_leaf(leaf: Any) -> str:
+def _describe_leaf(leaf: object) -> str:
     """Return kind and shape of a number, such as `float` or `int[3]`; the type's name of anything else."""
     if not _is_array(leaf):
         return type(leaf).__name__
@@ -252,7 +251,7 @@ def _describe_leaf(leaf: Any) -> str:
     return kind + (str(list(aval.shape)) if aval.shape else "")
 
 
-def _is_array(leaf: Any) -> bool:
+def _is_array(leaf: object) -> bool:
     try:
         jax.typeof(leaf)
     except TypeError:

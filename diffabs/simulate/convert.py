@@ -1,5 +1,7 @@
 """Conversion of a run to a summary, a pandas.DataFrame, an xarray.Dataset or a figure."""
 
+from typing import Any
+
 import jax
 import numpy as np
 from jax.core import Tracer
@@ -8,14 +10,14 @@ from diffabs.core.loop import LOOP_SIGNALS
 from diffabs.core.optional import import_optional
 from diffabs.core.protocols import Plant, Sample
 from diffabs.core.summary import Summary, round_for_table
-from diffabs.core.types import Params, Part, PyTree, Scalar
+from diffabs.core.types import Params, PyTree
 from diffabs.simulate.faults import describe_faults
 
 NUMBER_TYPES = (jax.Array, np.ndarray, np.generic, float, int, bool)
 DEFAULT_CONTROL_UNIT = "control"  # unit of the control if no plant is given
 
 
-def _is_concrete(run: PyTree) -> bool:
+def _is_concrete(run: object) -> bool:
     """Return True if a run holds numbers, False inside a function that JAX traces."""
     leaves = jax.tree.leaves(run)
     return all(isinstance(x, NUMBER_TYPES) and not isinstance(x, Tracer) for x in leaves)
@@ -86,7 +88,7 @@ def trajectory_columns(run: PyTree, plant: Plant | None = None) -> dict[str, tup
     return {name: (unit, np.asarray(values)[:rows]) for name, (unit, values) in columns.items()}
 
 
-def to_pandas(run: PyTree, plant: Part = None) -> Scalar:
+def to_pandas(run: PyTree, plant: Plant | None = None) -> Any:
     """Return a pandas.DataFrame: the trajectory indexed by `t`, or without a trajectory one row per run.
 
     A trajectory has units, metrics and end flags in `attrs`. A row per run has the metrics and the end flags as
@@ -106,7 +108,7 @@ def to_pandas(run: PyTree, plant: Part = None) -> Scalar:
     return frame
 
 
-def to_xarray(run: PyTree, plant: Part = None) -> Scalar:
+def to_xarray(run: object, plant: Plant | None = None) -> Any:
     """Return the trajectory as an xarray.Dataset over `t` [s], with `units` of variables and the metrics in `attrs`."""
     xarray = import_optional("xarray")
 
@@ -115,7 +117,7 @@ def to_xarray(run: PyTree, plant: Part = None) -> Scalar:
     return xarray.Dataset(each, coords={"t": each.pop("t")}, attrs=_attributes(run))
 
 
-def to_figure(run: PyTree, plant: Part = None, title: str = "") -> Scalar:
+def to_figure(run: PyTree, plant: Plant | None = None, title: str = "") -> Any:
     """Return a matplotlib figure of the run. The signals of the plant's output select the kind of figure."""
     from diffabs.plot import draw_run  # upwards: the one such import, for the method of `Run`
 

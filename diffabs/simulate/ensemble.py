@@ -216,7 +216,7 @@ def _run_vmapped(
     """
     every = solver.every if trajectories else 0
 
-    def run_group(lanes: Any, duration: float) -> Run:
+    def run_group(lanes: object, duration: float) -> Run:
         like = dataclasses.replace(solver, duration=duration)
         return batch.each(loop, lambda member, key: run_unchecked(member, like, objectives, key, every, engine), lanes)
 

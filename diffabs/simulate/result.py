@@ -69,7 +69,7 @@ def observe(loop: Loop, t: Scalar, state: LoopState, running: AnyArray) -> Traje
     return Trajectory(signals.sample, signals.measured, state.plant, running)
 
 
-def _is_impossible(name: str, objective: Objective, value: Scalar) -> Bool:
+def _is_impossible(name: str, objective: Objective, value: Any) -> Bool:
     """Return True if no real run has this value.
 
     An audit must be at most 1. A metric must be finite and within its range `physical`, or equal to its `unreached`. A

@@ -22,7 +22,7 @@ from diffabs.core.numerics import void_derivatives
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero
-from diffabs.core.types import Key, PyTree, Scalar
+from diffabs.core.types import Array, Key, PyTree, Scalar
 from diffabs.simulate.arguments import prepare_arguments, refuse_derivative, refuse_values
 from diffabs.simulate.drive.deferred import run_deferred
 from diffabs.simulate.drive.engine import default_engine
@@ -192,7 +192,7 @@ class RunCapacity(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=1)
-def _truncate_trajectory(trajectory: PyTree, count: int) -> PyTree:
+def _truncate_trajectory(trajectory: object, count: int) -> PyTree:
     return jax.tree.map(lambda x: x[:count], trajectory)
 
 
@@ -226,7 +226,7 @@ def _rule(capacity: RunCapacity, primals: PyTree, tangents: PyTree) -> tuple[PyT
     return jvp_nonzero(reversible, primals, tangents, once=_second_derivative_objection(loop, method))
 
 
-def _second_derivative_objection(loop: Loop, method: PyTree) -> str:
+def _second_derivative_objection(loop: Loop, method: object) -> str:
     """Return the reason why a run has no second derivatives, or an empty string."""
     if isinstance(method, AdaptiveStepping):
         return "runs with adaptive steps have no second derivatives; d.FixedStep has"
@@ -337,7 +337,7 @@ def _attach_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, later:
     """Return the run with its trajectory: first and later instants, and the last one repeated after the end."""
     run, last = judged
 
-    def join(a: Scalar, b: Scalar, c: Scalar) -> PyTree:
+    def join(a: Scalar, b: Array, c: Scalar) -> PyTree:
         # Rows after the end contain anything, so the last instant replaces them.
         b = jnp.where(jnp.expand_dims(later.running, range(1, b.ndim)), b, c)
         return jnp.concatenate([jnp.asarray(a)[None], b])

@@ -42,7 +42,7 @@ from diffabs.core.loop import LoopState, Margins, Signals
 from diffabs.core.numerics import invalidate
 from diffabs.core.protocols import Clock, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
-from diffabs.core.types import AnyArray, Array, Bool, Part, PyTree, Scalar
+from diffabs.core.types import AnyArray, Array, Bool, Numbers, Part, PyTree, Scalar
 from diffabs.simulate.admissible import find_solver_faults
 from diffabs.simulate.arguments import build_stepping
 from diffabs.simulate.drive.deferred import run_deferred
@@ -128,7 +128,7 @@ class Switch(NamedTuple):
 
     source: str
     operation: str
-    margin: Array
+    margin: Numbers
     flips: tuple[float, ...]
 
 
@@ -204,7 +204,7 @@ class Function:
     call: Callable = dataclasses.field(compare=False)
     place: int | None = None
 
-    def __call__(self, t: Scalar, y: PyTree, args: PyTree, constants: list[PyTree]) -> PyTree:
+    def __call__(self, t: Array, y: object, args: object, constants: list[PyTree]) -> PyTree:
         """Return the result at (`t`, `y`, `args`), with the type of `t`, and the `constants` of all functions."""
         values = self.call(t, y, args) if self.place is None else self.call(t, y, args, constants[self.place])
         return jax.tree.map(lambda x: jnp.asarray(x, t.dtype), values)
@@ -236,11 +236,11 @@ class FieldCode(NamedTuple):
 class FieldPlant:
     """The plant of a `FieldLoop`: its state is the state of the field."""
 
-    def project(self, state: PyTree) -> PyTree:
+    def project(self, state: object) -> PyTree:
         """Return the state."""
         return state
 
-    def output(self, state: PyTree) -> FieldOutput:
+    def output(self, state: object) -> FieldOutput:
         """Return the signals in a state."""
         return FieldOutput(0.0, state)
 
@@ -337,11 +337,11 @@ class FieldLoop:
             lambda: state,
         )
 
-    def _change(self, t: Scalar, state: LoopState, margins: Margins, fired: Sequence[Bool]) -> LoopState:
+    def _change(self, t: Any, state: LoopState, margins: Margins, fired: Sequence[Bool]) -> LoopState:
         was, stops = margins["events"], margins["stop"][1:]
         held = state.controller.held
 
-        def apply_resets(t: Scalar, y: PyTree) -> tuple[tuple[PyTree, list[Scalar]], list[Bool]]:
+        def apply_resets(t: Array, y: object) -> tuple[tuple[PyTree, list[Scalar]], list[Bool]]:
             """Return the state after the resets with all conditions there, and which events have happened."""
             moved, happened = False, []
             for i, (event, happens) in enumerate(zip(self.code.inner, fired, strict=True)):
@@ -380,9 +380,9 @@ class FieldLoop:
 
     def _arm(
         self,
-        t: Scalar,
-        before: PyTree,
-        y: PyTree,
+        t: Array,
+        before: object,
+        y: object,
         event: Event,
         happens: Bool,
         fired: Bool,
@@ -421,21 +421,21 @@ class FieldLoop:
         old_lift = jnp.where(happens, 0.0, lift)
         return jax.lax.stop_gradient(jnp.where(zero & (happens | ~unmoved), new, old_lift)), fault
 
-    def _rounding_error(self, condition: Callable, t: Scalar, y: PyTree) -> Scalar:
+    def _rounding_error(self, condition: Callable, t: Array, y: PyTree) -> Any:
         """Return how far rounding may move a condition in the state `y` at `t`."""
         t, y = jax.lax.stop_gradient((t, y))
         slopes = jax.grad(lambda t, y: self._call(condition, t, y), argnums=(0, 1))(t, y)
         terms = zip(jax.tree.leaves(slopes), jax.tree.leaves((t, y)), strict=True)
         return LIFT_EPS * jnp.finfo(t.dtype).eps * sum(jnp.sum(jnp.abs(a * b)) for a, b in terms)
 
-    def _call(self, function: Callable, t: Scalar, y: PyTree) -> PyTree:
+    def _call(self, function: Callable, t: Scalar, y: object) -> PyTree:
         """Return the result of a function at the time `t` in units of the span."""
         return function(self.time(t), y, self.inputs["args"], self.inputs["constants"])
 
-    def _rate(self, t: Scalar, y: PyTree) -> PyTree:
+    def _rate(self, t: Scalar, y: object) -> PyTree:
         return jax.tree.map(lambda x: self.span * x, self.field(t, y))
 
-    def field(self, t: Scalar, y: PyTree) -> PyTree:
+    def field(self, t: Scalar, y: object) -> PyTree:
         """Return dy/dt at the time `t` in units of the span."""
         return self._call(self.code.field, t, y)
 
@@ -446,7 +446,7 @@ class FieldLoop:
         away = jnp.where(rate < 0, jnp.abs(margin) / jnp.where(rate < 0, -rate, 1.0), jnp.inf)
         return jnp.where(away <= COINCIDENCE_FRACTION, 0.0, away)
 
-    def _follow(self, condition: Callable, t: Scalar, y: PyTree) -> tuple[Scalar, Scalar]:
+    def _follow(self, condition: Callable, t: Scalar, y: object) -> tuple[Scalar, Scalar]:
         """Return a condition and its rate along the field, from the state `y` at `t` on."""
         moves = (jnp.ones_like(t), self._rate(t, y))
         return jax.jvp(lambda t, y: self._call(condition, t, y), (t, y), moves)
@@ -498,10 +498,10 @@ class Saves:
 @default_flags()
 def solve(
     field: Field,
-    y0: PyTree,
-    t0: Scalar,
+    y0: object,
+    t0: Array,
     t1: Scalar,
-    args: PyTree = None,
+    args: object = None,
     *,
     solver: Solver,
     events: Sequence[Event] = (),
@@ -605,7 +605,13 @@ def solve(
 
 @default_flags()
 def switches(
-    field: Field, t: Scalar, y: PyTree, args: PyTree = None, *, t1: Scalar = None, solver: Adaptive = SWITCH_SOLVER
+    field: Field,
+    t: Array,
+    y: object,
+    args: object = None,
+    *,
+    t1: Scalar | None = None,
+    solver: Adaptive = SWITCH_SOLVER,
 ) -> list[Switch]:
     """Return the switches of a field: its comparisons that depend on time or state, and where they flip.
 
@@ -668,10 +674,10 @@ def _list_flips(loop: Part, solver: Adaptive) -> list[tuple[float, int]]:
 
 def _build_loop(
     field: Field,
-    y0: PyTree,
-    t0: Scalar,
+    y0: object,
+    t0: Array,
     t1: Scalar,
-    args: PyTree,
+    args: object,
     events: tuple[Event, ...],
     save: AnyArray | None,
     times_per_event: int,
@@ -809,7 +815,7 @@ def _read_times(t0: Scalar, t1: Scalar, save: AnyArray | None) -> None:
             raise ValueError(f"save has {outside[0]}; times in [{low:g}, {high:g}] are possible")
 
 
-def _refuse_leaves(name: str, tree: PyTree) -> None:
+def _refuse_leaves(name: str, tree: object) -> None:
     """Raise a ValueError for a leaf that is no real number or array of numbers."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if line := kinds.find_value_objection(leaf):
@@ -818,7 +824,9 @@ def _refuse_leaves(name: str, tree: PyTree) -> None:
             )
 
 
-def _read_solver(solver: Any, t0: Scalar, t1: Scalar, dtype: DTypeLike) -> tuple[FixedStepping | AdaptiveStepping, int]:
+def _read_solver(
+    solver: object, t0: Scalar, t1: Scalar, dtype: DTypeLike
+) -> tuple[FixedStepping | AdaptiveStepping, int]:
     """Return the stepping method in units of the span, and the number of its steps."""
     count = 1
     if isinstance(solver, Adaptive):
@@ -880,7 +888,7 @@ def _read_functions(
     return dynamics, tuple(event_functions), constants
 
 
-def _check_result(name: str, shapes: PyTree, like: PyTree) -> None:
+def _check_result(name: str, shapes: object, like: object) -> None:
     """Check that a function returns real numbers with structure and shapes of `like`."""
     if jax.tree.structure(shapes) != jax.tree.structure(like):
         structure, needed = jax.tree.structure(shapes), jax.tree.structure(like)
@@ -911,7 +919,7 @@ def _describe_program(program: jex.ClosedJaxpr | jex.Jaxpr, constants: Sequence[
     return tuple(begins), tuple(rows), read(x.outvars), _describe(list(constants), hidden)
 
 
-def _describe(x: Any, hidden: list[Any]) -> Any:
+def _describe(x: object, hidden: list[Any]) -> Any:
     """Return a description that is equal for equal programs or parameters; `hidden` gets the parameters not read."""
     if isinstance(x, jex.ClosedJaxpr | jex.Jaxpr):
         return _describe_program(x, getattr(x, "consts", ()), hidden)
@@ -931,7 +939,7 @@ def _describe(x: Any, hidden: list[Any]) -> Any:
     return type(x), str(getattr(x, "debug_info", None))
 
 
-def _hashable(function: Any) -> Any:
+def _hashable(function: object) -> Any:
     try:
         hash(function)
     except TypeError:  # a callable with arrays in it: equal to itself only

@@ -60,7 +60,7 @@ def _largest_stable_steps(matrices: np.ndarray) -> np.ndarray:
     return limits.min(axis=tuple(range(1, limits.ndim)), initial=np.inf)
 
 
-def is_step_stable(loop: Part, values: PyTree, step: float) -> np.ndarray:
+def is_step_stable(loop: object, values: object, step: float) -> np.ndarray:
     """Return True for each run for which the step [s] is stable, bool, shape (runs,).
 
     Without a common loop, `values` is a batch of loops whose leaves have a leading axis.
@@ -83,11 +83,11 @@ def _as_single_precision(*trees: PyTree) -> PyTree:
     return jax.tree.map(lambda x: np.asarray(x, np.float32), trees)
 
 
-def _at(values: PyTree, lanes: np.ndarray) -> PyTree:
+def _at(values: object, lanes: np.ndarray) -> PyTree:
     return jax.tree.map(lambda x: np.asarray(x)[lanes], values)
 
 
-def _is_known_stable(loop: Part, values: PyTree, step: float, squarings: int | None) -> np.ndarray:
+def _is_known_stable(loop: object, values: object, step: float, squarings: int | None) -> np.ndarray:
     """Return True for each run whose step is known to be stable. The proof is a bound with so many squarings; with None
     the eigenvalues.
     """
@@ -100,7 +100,7 @@ def _is_known_stable(loop: Part, values: PyTree, step: float, squarings: int | N
 
 
 @jax.jit
-def _build_loops(loop: Part, values: PyTree) -> Loop:
+def _build_loops(loop: object, values: object) -> Loop:
     return canonical_dtypes(jax.vmap(_lane_builder(loop))(values))
 
 
@@ -110,12 +110,12 @@ def _lane_builder(loop: Part) -> Callable[[PyTree], Loop]:
 
 
 @partial(jax.jit, static_argnames="squarings")
-def _bounds(loop: Part, values: PyTree, *, squarings: int) -> jax.Array:
+def _bounds(loop: object, values: object, *, squarings: int) -> jax.Array:
     """Return an upper bound on |lambda| of all modes for each run [1/s], shape (runs,); infinite if unknown."""
     count = len(jax.tree.leaves(values)[0])
 
     @jax.jit  # traced once, used three times
-    def matrices(values: PyTree) -> jax.Array:
+    def matrices(values: object) -> jax.Array:
         return jnp.reshape(jacobians := _jacobians_of(_lane_builder(loop)(values)), (-1, *jacobians.shape[-2:]))
 
     drain = jax.vmap(lambda values: _drain_rate(_lane_builder(loop)(values)))(values)
@@ -127,7 +127,7 @@ def _bounds(loop: Part, values: PyTree, *, squarings: int) -> jax.Array:
     places = jnp.minimum(jnp.arange(-(-count // LANES_PER_CHUNK) * LANES_PER_CHUNK), count - 1)
     filled = jax.tree.map(lambda x: x[places], values) if count > LANES_PER_CHUNK else values
 
-    def bound(values: PyTree) -> jax.Array:
+    def bound(values: object) -> jax.Array:
         if squarings or len(first_matrices) * count < MIN_ENTRYWISE_MATRICES:
             return _power_norm_bound(matrices(values), balance, squarings)
         return _norm_bound(_map_over_probes(_entries, _lane_builder(loop)(values)), balance)
@@ -255,10 +255,10 @@ class _AtTarget:
 
     reference: Reference = part()
 
-    def start(self, signal: PyTree) -> Memory:
+    def start(self, signal: object) -> Memory:
         return self.reference.start(signal)
 
-    def flow(self, t: Scalar, memory: Memory, signal: PyTree) -> PyTree:
+    def flow(self, t: Scalar, memory: Memory, signal: object) -> PyTree:
         return self.reference.flow(t, memory, signal)
 
     def output(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:

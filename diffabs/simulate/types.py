@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,13 @@ import numpy as np
 
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.meanings import document_fields
-from diffabs.core.protocols import Ending, Sample
-from diffabs.core.types import AnyArray, Bool, Int, Part, PyTree, Scalar
+from diffabs.core.protocols import Ending, Plant, Sample
+from diffabs.core.types import AnyArray, Bool, Int, PyTree, Scalar
 from diffabs.simulate import convert
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 
 @document_fields
@@ -247,21 +251,21 @@ class Run(NamedTuple):
         """Return the summary for a notebook."""
         return convert.summarise_run(self)._repr_html_()
 
-    def pandas(self, plant: Part = None) -> Scalar:
+    def pandas(self, plant: Plant | None = None) -> "pandas.DataFrame":
         """Return a pandas.DataFrame: the trajectory indexed by `t`, or without a trajectory one row per run.
 
         See `to_pandas`. The `plant` defines the unit of the control. Trajectories of a batch raise a ValueError.
         """
         return convert.to_pandas(self, plant)
 
-    def xarray(self, plant: Part = None) -> Scalar:
+    def xarray(self, plant: Plant | None = None) -> "xarray.Dataset":
         """Return the trajectory as an xarray.Dataset over the time, each variable with `units`.
 
         The `plant` defines the unit of the control. A run without a trajectory or a batch raises a ValueError.
         """
         return convert.to_xarray(self, plant)
 
-    def plot(self, plant: Part = None, *, title: str = "") -> Scalar:
+    def plot(self, plant: Plant | None = None, *, title: str = "") -> Any:
         """Return the run as a matplotlib figure (extra `plot`) with this `title`.
 
         The `plant` defines the unit of the control. A run without a trajectory raises a ValueError.

@@ -213,7 +213,7 @@ def _compute_chunks(
             fill()
 
 
-def _wait_for_chunk(client: Client, finished: Scalar, stopping: Callable[[], bool]) -> bool:
+def _wait_for_chunk(client: Client, finished: as_completed, stopping: Callable[[], bool]) -> bool:
     """Wait for the next chunk and return True, or False if none will come: Ctrl-C in a terminal also ends workers."""
     while not finished.has_ready():
         if stopping() and not client.nthreads():

@@ -153,7 +153,7 @@ class Empirical(_Discrete):
             yield f"{name}: values = {reprlib.repr(list(self.values))} are not all in {FINITE_SPEC.interval()}"
 
 
-def _read_columns(table: PyTree, where: str) -> dict[str, np.ndarray]:
+def _read_columns(table: object, where: str) -> dict[str, np.ndarray]:
     return {
         path: np.array(column)
         for path, column in table_reader(list_reader(read_as_given), "lists")(table, where).items()

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from diffabs.config.values import check_sound, format_table, kebab_case, read_one
 from diffabs.core.pytree import ParameterSpec, param
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Scalar
 from diffabs.sweep.discrete import Categorical as Categorical
 from diffabs.sweep.discrete import Empirical as Empirical
 from diffabs.sweep.discrete import is_numeric
@@ -55,8 +55,8 @@ class Distribution(Protocol):
 class _Continuous:
     """Common methods of distributions between `low` and `high`: quantiles by p and q, ranges of the fields."""
 
-    low: Scalar
-    high: Scalar
+    low: float
+    high: float
 
     def value(self, u: ArrayLike) -> np.ndarray:
         return self._at(np.asarray(u), 1 - np.asarray(u))
@@ -209,7 +209,7 @@ DISTRIBUTION_TYPES = {
 }
 
 
-def read_distribution(table: PyTree, where: str, kinds: Mapping[str, type] = DISTRIBUTION_TYPES) -> Scalar:
+def read_distribution(table: object, where: str, kinds: Mapping[str, type] = DISTRIBUTION_TYPES) -> Distribution:
     """Return the distribution that a table describes."""
     return check_sound(read_one(kinds, table, where), where)
 

@@ -112,7 +112,7 @@ def read_manifest(folder: pathlib.Path) -> JsonObject:
         raise SweepError(f"{folder} is no sweep that can be read: {MANIFEST_NAME}: {why}") from None
 
 
-def _check_manifest(document: PyTree) -> JsonObject:
+def _check_manifest(document: object) -> JsonObject:
     if not isinstance(document, dict):
         raise wrong_kind_error("it", document, "a table")
     if document.get("format") in EARLIER_FORMATS:
@@ -159,7 +159,7 @@ class _Adaptive(_Solver):
     rtol: float = table_field(range_reader(FINITE_SPEC))
 
 
-def _read_solver(entry: PyTree, path: str) -> _Solver:
+def _read_solver(entry: object, path: str) -> _Solver:
     table = {"type": "fixed", **entry} if isinstance(entry, Mapping) else entry
     return read_one({"fixed": _Fixed, "adaptive": _Adaptive}, table, path)
 

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.core.optional import import_optional
 from diffabs.core.summary import Summary
-from diffabs.core.types import JsonObject, Matrix, PyTree, Scalar
+from diffabs.core.types import JsonObject, PyTree, Scalar
 from diffabs.runtime import files
 from diffabs.sweep import seal
 from diffabs.sweep.manifest import Seals, read_manifest
@@ -173,7 +173,7 @@ class Results:
     def polars(self) -> Scalar:
         """Return a polars.DataFrame with a column `failed`."""
         polars = import_optional("polars")
-        frame: Matrix = polars.from_arrow(self.table())
+        frame = polars.from_arrow(self.table())
         return frame.with_columns(polars.Series("failed", self.failed_samples()))
 
     def xarray(self) -> PyTree:

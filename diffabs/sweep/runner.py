@@ -132,7 +132,7 @@ class Runner:
             columns = jax.device_get(_measure_block(*arguments, self.study.solver, self.study.engine))
         return columns | {"refused": admissibility.texts.astype(object)}
 
-    def _arguments(self, loop: Part, block: _Block, accepted: Bool) -> tuple[PyTree, ...]:
+    def _arguments(self, loop: object, block: _Block, accepted: Bool) -> tuple[PyTree, ...]:
         numbers = loop, dict(self.study.objectives), block.values
         converted = jax.tree.map(lambda x: np.asarray(x, self.study.dtype), numbers)
         return *converted, np.asarray(self.study.seed), block.samples.astype(np.uint32), accepted

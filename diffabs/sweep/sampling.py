@@ -292,7 +292,7 @@ class Saltelli(SamplingDesign):
 DESIGN_TYPES = {kebab_case(cls.__name__): cls for cls in (Random, Sobol, LatinHypercube, Grid, Corners, Saltelli)}
 
 
-def read_sampling_design(entry: PyTree, where: str) -> SamplingDesign:
+def read_sampling_design(entry: object, where: str) -> SamplingDesign:
     """Return the design of a table, or of the bare name of a type."""
     return check_sound(read_one(DESIGN_TYPES, entry, where), where)
 

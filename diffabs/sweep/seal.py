@@ -19,7 +19,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from diffabs.config.values import ScenarioError
-from diffabs.core.types import Scalar
 
 CHUNK_NAME_PATTERN = re.compile(r"part-(\d{8,})-([0-9a-f]{16})\.parquet")
 DIGEST_DIGITS = 16
@@ -56,7 +55,7 @@ class Seal(NamedTuple):
         return {f"diffabs.{name}".encode(): value.encode() for name, value in entries.items()}
 
 
-def json_digest(value: Scalar) -> str:
+def json_digest(value: object) -> str:
     """Return the SHA-256 of JSON values; the order of names counts, because it is the order of a design's columns."""
     return hashlib.sha256(json.dumps(value, separators=(",", ":")).encode()).hexdigest()
 

@@ -11,11 +11,10 @@ import contextlib
 import json
 import pathlib
 from collections.abc import Iterator
-from typing import Any
 
 import filelock
 
-from diffabs.core.types import JsonObject, PyTree, Scalar, Table
+from diffabs.core.types import JsonObject, Table
 from diffabs.runtime import files
 from diffabs.sweep import seal
 from diffabs.sweep.manifest import MANIFEST_NAME as MANIFEST_NAME
@@ -167,7 +166,7 @@ def read_chunk(path: pathlib.Path) -> bytes:
         raise SweepError(f"{path} cannot be read: {error.strerror}; move it away") from None
 
 
-def describe_differences(existing: Any, expected: PyTree, path: str = "") -> Iterator[str]:
+def describe_differences(existing: object, expected: object, path: str = "") -> Iterator[str]:
     """Yield one line for each difference between two documents, also of the order of equal entries.
 
     The order of the variables decides their samples.
@@ -196,6 +195,6 @@ def _decisive_entries(manifest: Table) -> JsonObject:
     }
 
 
-def _abbreviate(value: Scalar) -> str:
+def _abbreviate(value: object) -> str:
     text = json.dumps(value)
     return text if len(text) <= MAX_VALUE_CHARACTERS else f"{text[: MAX_VALUE_CHARACTERS - 3]}..."

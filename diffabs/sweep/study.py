@@ -197,7 +197,7 @@ class Study:
                 yield str(error)
 
 
-def _part_problems(path: str, distribution: Any, choices: Table, loop: Loop) -> Iterator[str]:
+def _part_problems(path: str, distribution: object, choices: Table, loop: Loop) -> Iterator[str]:
     try:
         get(loop, path)
     except KeyError as error:

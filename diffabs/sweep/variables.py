@@ -18,7 +18,7 @@ from diffabs.config.values import (
     table_reader,
 )
 from diffabs.core.pytree import ParameterSpec
-from diffabs.core.types import AnyArray, JsonObject, Matrix, Params, PyTree, Table
+from diffabs.core.types import AnyArray, JsonObject, Matrix, Params, Table
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.discrete import Rows as Rows
 from diffabs.sweep.discrete import is_numeric
@@ -79,12 +79,12 @@ class Correlation:
             yield f"{name}: matrix is not positive definite: {low}"
 
 
-def read_correlation(table: PyTree, where: str) -> Correlation:
+def read_correlation(table: object, where: str) -> Correlation:
     """Return the correlation of a table."""
     return check_sound(values.read_table(Correlation, table, where), where)
 
 
-def _read_variable(entry: PyTree, where: str) -> Any:
+def _read_variable(entry: object, where: str) -> Any:
     return distributions.read_distribution(entry, where, distributions.DISTRIBUTION_TYPES | {"rows": Rows})
 
 
@@ -200,7 +200,7 @@ class Space:
         return {"variables": variables, **correlation, "design": as_plain(self.design, brief=True)}
 
 
-def read_space(table: PyTree, where: str) -> Space:
+def read_space(table: object, where: str) -> Space:
     """Return the space of a table with `variables`, and optionally `correlation` and `design`."""
     return values.read_table(Space, table, where)
 

@@ -21,7 +21,7 @@ import numpy as np
 import optax
 
 from diffabs.core.reason import Reason
-from diffabs.core.types import Matrix, PyTree, Scalar
+from diffabs.core.types import Matrix, PyTree, Scalar, Vector
 from diffabs.tune.method import Stopping
 from diffabs.tune.problem import LossEvaluation, Multipliers
 from diffabs.tune.result import DescentPoint
@@ -75,7 +75,7 @@ class DescentState:
 
     z: np.ndarray
     loss: float
-    gradient: np.ndarray
+    gradient: Vector
     evaluation: Any
     update: np.ndarray
     t: float = 1.0
@@ -181,7 +181,7 @@ class Descent:
         self.searches = optimiser.searches
         self._init = jax.jit(jax.vmap(optimiser.transformation.init))
 
-        def update(g: Matrix, state: PyTree, z: Matrix, value: Scalar, m: Scalar) -> Any:
+        def update(g: Matrix, state: object, z: Matrix, value: Scalar, m: Scalar) -> Any:
             more = {"value": value, "grad": g, "value_fn": lambda z: loss(z, m)}
             return optimiser.transformation.update(g, state, z, **more)
 
@@ -357,7 +357,7 @@ def _next_step_factor(descent_state: DescentState, loss: float, slope: float) ->
     return descent_state.t * min(0.5, max(0.1, -slope * descent_state.t / (2 * bend)))
 
 
-def _is_descent_direction(update: np.ndarray, gradient: np.ndarray) -> bool:
+def _is_descent_direction(update: np.ndarray, gradient: Vector) -> bool:
     """Return whether the update is finite and at an acute angle to the negative gradient."""
     size = np.linalg.norm(update) * np.linalg.norm(gradient)
     return bool(np.isfinite(size) and update @ gradient < -1e-10 * size)
@@ -368,6 +368,6 @@ def _select_by_start(mask: np.ndarray, a: Scalar, b: Scalar) -> PyTree:
     return jax.tree.map(lambda x, y: jnp.where(mask.reshape(-1, *[1] * (jnp.ndim(x) - 1)), x, y), a, b)
 
 
-def slice_start(tree: PyTree, i: int) -> PyTree:
+def slice_start(tree: object, i: int) -> PyTree:
     """Return the tree of one start: entry `i` along the leading axis of each leaf."""
     return jax.tree.map(lambda x: x[i], tree)

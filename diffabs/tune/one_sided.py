@@ -54,7 +54,7 @@ def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, PyTr
         yield "the relay starts on its target, where its first state jumps", signals.measured[0], signals.sample.target
 
 
-def warn(subject: Part, values: Params, batch: Batch, solver: Solver, where: str) -> None:
+def warn(subject: object, values: Params, batch: Batch, solver: Solver, where: str) -> None:
     """Issue a UserWarning that begins with `where` for each condition under which a derivative is one-sided in some
     run.
     """
@@ -84,7 +84,7 @@ def warn(subject: Part, values: Params, batch: Batch, solver: Solver, where: str
             warnings.warn(f"{where}: {name}{runs}, so {side}; {ADVICE}", stacklevel=3)
 
 
-def _actuators(actuator: Part) -> Iterator[tuple[str, PyTree]]:
+def _actuators(actuator: object) -> Iterator[tuple[str, PyTree]]:
     """Yield the path and the part of an actuator, or of each actuator in a series."""
     series = getattr(actuator, "blocks", None)
     if isinstance(series, tuple):

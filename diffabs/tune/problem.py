@@ -23,7 +23,7 @@ from diffabs.core.compiling import SAME_RESULT_OPTIONS
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes
-from diffabs.core.types import AnyArray, Bool, Int, Part, PyTree, Scalar, Vector
+from diffabs.core.types import AnyArray, Array, Bool, Int, Part, PyTree, Scalar, Vector
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.drive.deferred import MANY_INPUTS_REASON, find_kernels
@@ -53,7 +53,7 @@ class ObjectiveEvaluation(NamedTuple):
 class LossEvaluation(NamedTuple):
     """The loss, its gradient (p,) and the evaluation of the objective, with a leading axis of starts if batched."""
 
-    loss: Scalar
+    loss: Array
     gradient: Vector
     evaluation: ObjectiveEvaluation
 
@@ -61,9 +61,9 @@ class LossEvaluation(NamedTuple):
 class Multipliers(NamedTuple):
     """The multipliers (k,), penalty and margin of the augmented Lagrangian; a margin of None means zero."""
 
-    values: PyTree
-    penalty: Scalar
-    margin: Scalar = None
+    values: np.ndarray
+    penalty: np.ndarray
+    margin: Any = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -213,7 +213,7 @@ def choose_gradient_mode(space: FreeSpace) -> DerivativeMode:
     return DerivativeMode.FORWARD if space.size <= MAX_FORWARD_PARAMETERS else DerivativeMode.REVERSE
 
 
-def _penalty(excess: Any, m: Multipliers) -> Scalar:
+def _penalty(excess: object, m: Multipliers) -> Scalar:
     """Return the sum over the excesses of [max(0, m + c (g + d))^2 - m^2]/(2 c)."""
     aimed = excess if m.margin is None else excess + m.margin
     return jnp.sum(jnp.maximum(0.0, m.values + m.penalty * aimed) ** 2 - m.values**2) / (2 * m.penalty)

@@ -12,7 +12,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, get, replace
 from diffabs.core.tracing import used_inputs
-from diffabs.core.types import Params, Part, PyTree
+from diffabs.core.types import Params, PyTree
 from diffabs.core.validity import check_part
 from diffabs.objectives import default_objectives
 from diffabs.runtime.interactive import ProgressLine, report_to
@@ -101,7 +101,7 @@ def tune(
 
 @default_flags()
 def build_problem(
-    subject: Part,
+    subject: object,
     *,
     free: Sequence[str] | Mapping[str, Range | None],
     objective: Mapping[str, float],
@@ -226,7 +226,7 @@ def _check_constraints(
     return requirements
 
 
-def _check_not_overwritten(subject: Part, space: FreeSpace, batch: Batch) -> None:
+def _check_not_overwritten(subject: object, space: FreeSpace, batch: Batch) -> None:
     """Raise a ValueError if `over` or `closed_loop()` overwrites a free parameter: the search could not move it."""
 
     def loops(values: Params) -> PyTree:

@@ -101,7 +101,7 @@ def alpha_beta(config: Config) -> tuple[float, float]:
     mu, slope = jax.jvp(lambda s: rig.road.friction(s, 0.0, 0.0), (0.2,), (1.0,))
     wheel = rig.wheel_radius**2 / (rig.wheel_inertia * rig.body_radius)
     alpha = -force * (wheel * slope + (0.8 * slope - mu) * rig.body_radius / body)
-    return float(alpha), rig.wheel_radius / (rig.wheel_inertia * rig.body_radius)
+    return float(alpha), float(rig.wheel_radius / (rig.wheel_inertia * rig.body_radius))
 
 
 def critical_lags(config: Config) -> list[dict[str, Any]]:

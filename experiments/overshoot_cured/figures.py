@@ -39,9 +39,9 @@ def all_masses(config: Any, loops: Mapping[str, Loop]) -> Any:
     for i, (ax, (name, one)) in enumerate(zip(axes, loops.items(), strict=True)):
         run = run_batch(one, lanes, FixedStep(config.step, config.duration, every=4), BRAKING, trajectories=True)
         sample, masses = run.trajectory.sample, lanes.values["plant.mass"]
-        shown = np.asarray(sample.t[0]) <= UNTIL
+        shown = np.asarray(sample.t)[0] <= UNTIL
         for mass, slip in zip(masses, np.asarray(sample.output.slip), strict=True):
-            ax.plot(np.asarray(sample.t[0])[shown], slip[shown], color=colours(norm(mass)), linewidth=0.7, alpha=0.7)
+            ax.plot(np.asarray(sample.t)[0][shown], slip[shown], color=colours(norm(mass)), linewidth=0.7, alpha=0.7)
         ax.axhline(config.slip, color="black", linewidth=0.8, linestyle=":")
         worst = 100 * float(np.max(run.metrics["overshoot"]))
         plot.label_axes(

@@ -65,7 +65,7 @@ def loop(config: Config, controller: PID, period: float, delay: float, reference
 def slowest(config: Config, period: float, delay: float) -> float:
     """The speed below which the sampled loop is unstable, road neglected; `delay` in periods [m/s]."""
     limit = min(1 / delay if delay else np.inf, 2 / (1 - 2 * delay) if delay < 0.5 else np.inf)
-    return car().radius * config.kp * period / (car().inertia * limit)
+    return float(car().radius * config.kp * period / (car().inertia * limit))
 
 
 def sweep(config: Config) -> list[dict[str, Any]]:

@@ -107,7 +107,7 @@ class Curve:
             cubic = PchipInterpolator(np.asarray(road.slip), np.asarray(road.mu))
             self.knots, self.rows = cubic.x.tolist(), cubic.c.T.tolist()
         elif isinstance(road, roads.Burckhardt):
-            self.knots, self.c = [0.0, math.inf], (road.c1, road.c2, road.c3, road.c4)
+            self.knots, self.c = [0.0, math.inf], tuple(map(float, (road.c1, road.c2, road.c3, road.c4)))
         else:
             raise TypeError(type(road))
         self.tabulated = isinstance(road, roads.Tabulated)

@@ -49,7 +49,7 @@ def plant_rates(plant):
     mu = friction(plant.road)
     if isinstance(plant, QuarterCar):
 
-        def rates(v, w, x, extra, u):
+        def rates(v, w, x, extra, u):  # pyright: ignore[reportRedeclaration]  # of another branch
             m = np.copysign(mu(abs(slip_of(v, w)), v, x), slip_of(v, w))
             spin = (plant.radius * m * plant.mass * G - u) / plant.inertia
             return -m * G, plant.radius * (max(spin, 0) if w <= 0 else spin), 0.0

@@ -11,7 +11,6 @@ import numpy as np
 from diffabs.compiler.ir import Node, is_real
 from diffabs.compiler.lower.rules import Unsupported
 from diffabs.compiler.operations import OPERATIONS
-from diffabs.core.types import Scalar
 
 C_TYPES = {"int64": "int64_t", "uint64": "uint64_t", "int32": "int32_t", "uint32": "uint32_t", "bool": "bool"}
 FUNCTION = re.compile(r"(\w+)\{f\}")  # a function of the C library, in a template
@@ -77,7 +76,7 @@ class Words:
             return "true" if x else "false"
         return self.literal(x) if is_real(node.dtype) else f"(({C_TYPES[node.dtype.name]}){int(x)})"
 
-    def literal(self, x: Scalar) -> str:
+    def literal(self, x: float) -> str:
         """Return the C literal of the real number `x` (a NumPy scalar): the shortest decimal that reads back as `x`."""
         if np.isnan(x):
             return "NAN"

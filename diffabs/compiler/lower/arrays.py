@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from diffabs.compiler.ir import Array, Graph, Node
+from diffabs.compiler.ir import Graph, Node, NodeArray
 from diffabs.compiler.lower.elementwise import max_or_min
 from diffabs.compiler.lower.rules import Unsupported, as_node_array, constant_array, lowering_rule, map_entries
 from diffabs.core.types import Equation
 
 
 @lowering_rule("broadcast_in_dim", "shape broadcast_dimensions sharding")
-def _broadcast(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _broadcast(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     shape = eqn.params["shape"]
     wide = [1] * len(shape)
     for i, dimension in enumerate(eqn.params["broadcast_dimensions"]):
@@ -24,26 +24,26 @@ def _broadcast(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 @lowering_rule("reshape", "new_sizes dimensions sharding")
 @lowering_rule("squeeze", "dimensions")
 @lowering_rule("expand_dims", "dimensions")
-def _reshape(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
+def _reshape(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
     if eqn.primitive.name == "reshape" and eqn.params["dimensions"] is not None:
         raise Unsupported("reshape", "in another order of dimensions")
     return [ins[0].reshape(eqn.outvars[0].aval.shape)]
 
 
 @lowering_rule("slice", "start_indices limit_indices strides")
-def _slice(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _slice(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     p = eqn.params
     strides = p["strides"] or [1] * ins[0].ndim
     return [ins[0][tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]]
 
 
 @lowering_rule("concatenate", "dimension")
-def _concatenate(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _concatenate(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     return [np.concatenate(ins, eqn.params["dimension"])]
 
 
 @lowering_rule("pad", "padding_config")
-def _pad(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _pad(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     """Pad before, after and between the entries of each axis; a negative width crops."""
     x, value = ins[0], ins[1].item()
     # Order as in XLA: interior padding first, then a negative edge width crops the dilated array.
@@ -59,32 +59,32 @@ def _pad(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("transpose", "permutation")
-def _transpose(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _transpose(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     return [ins[0].transpose(eqn.params["permutation"])]
 
 
 @lowering_rule("rev", "dimensions")
-def _rev(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _rev(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     return [np.flip(ins[0], eqn.params["dimensions"])]
 
 
 @lowering_rule("stack", "axis")
-def _stack(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _stack(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     return [np.stack(ins, eqn.params["axis"])]
 
 
 @lowering_rule("unstack", "axis")
-def _unstack(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _unstack(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     return [as_node_array(x) for x in np.moveaxis(ins[0], eqn.params["axis"], 0)]
 
 
 @lowering_rule("split", "axis sizes")
-def _split(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _split(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     return list(np.split(ins[0], np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"]))
 
 
 @lowering_rule("iota", "dtype shape dimension sharding")
-def _iota(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _iota(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     shape, dimension = eqn.params["shape"], eqn.params["dimension"]
     along = np.arange(shape[dimension], dtype=eqn.params["dtype"])
     along = along.reshape([-1 if i == dimension else 1 for i in range(len(shape))])
@@ -100,7 +100,7 @@ NEUTRAL_ELEMENTS = {"sum": 0, "prod": 1, "and": True, "or": False}
 @lowering_rule("reduce_max", "axes out_sharding")
 @lowering_rule("reduce_min", "axes out_sharding")
 @lowering_rule("reduce_and reduce_or", "axes")
-def _reduce(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
+def _reduce(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
     """Reduce by pairs: the longest dependency chain of n entries has about log2(n) operations."""
     kind, x = eqn.primitive.name.removeprefix("reduce_"), ins[0]
     name: Any = REDUCTION_OPERATIONS.get(kind, kind)
@@ -123,7 +123,7 @@ def _reduce(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("cumsum", "axis reverse")
-def _cumsum(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _cumsum(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     order = slice(None, None, -1 if eqn.params["reverse"] else 1)
     # A reversed sum runs over the flipped rows, and the result is flipped back.
     if not ins[0].size:
@@ -135,7 +135,7 @@ def _cumsum(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("argmin argmax", "axes index_dtype")
-def _first_extreme(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _first_extreme(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     """Return the index of the first extreme entry, or of the first NaN if there is one, as JAX does."""
     if len(eqn.params["axes"]) != 1:
         raise Unsupported(eqn.primitive.name, "over several axes")
@@ -157,7 +157,7 @@ def _first_extreme(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]
 
 
 @lowering_rule("dot_general", "dimension_numbers precision preferred_element_type out_sharding")
-def _dot(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
+def _dot(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
     (left_axes, right_axes), batch = eqn.params["dimension_numbers"]
     if any(batch):
         raise Unsupported("dot_general", "of stacked arrays")

@@ -4,7 +4,7 @@ import jax
 import jax.extend.core as jex
 import numpy as np
 
-from diffabs.compiler.ir import Array, Graph
+from diffabs.compiler.ir import Graph, NodeArray
 from diffabs.compiler.lower.rules import (
     Unsupported,
     as_node_array,
@@ -26,12 +26,12 @@ MAX_UNROLLED_STEPS = 64  # bound on the length of a scan, because its steps are 
 )
 @lowering_rule("custom_jvp_call", "call_jaxpr jvp_jaxpr_fun num_consts symbolic_zeros")
 @lowering_rule("custom_vjp_call", "call_jaxpr fwd_jaxpr_thunk bwd num_consts out_trees symbolic_zeros")
-def _call(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
+def _call(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
     return inline_program(graph, eqn.params["call_jaxpr" if "call_jaxpr" in eqn.params else "jaxpr"], ins)
 
 
 @lowering_rule("custom_vmap_call", "call rule in_tree out_tree")
-def _custom_vmap_any(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
+def _custom_vmap_any(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
     """Lower the identity of a boolean whose custom rule for vmap is `any` over the batch; refuse other rules.
 
     `core.lanes.any_lane` is such a call.
@@ -54,7 +54,7 @@ def _is_any_rule(eqn: Equation) -> bool:
 
 
 @lowering_rule("cond", "branches")
-def _cond(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
+def _cond(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
     index, operands, branches = ins[0].item(), ins[1:], eqn.params["branches"]
     if index.op == "const":
         # XLA clamps an index that is out of range.
@@ -73,7 +73,7 @@ def _cond(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("scan", "length reverse jaxpr num_consts num_carry linear unroll _split_transpose ft_in ft_out")
-def _scan(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
+def _scan(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
     p = eqn.params
     if p["length"] > MAX_UNROLLED_STEPS:
         raise Unsupported("scan", f"of {p['length']} steps within a step; {MAX_UNROLLED_STEPS} are the most")
@@ -85,7 +85,7 @@ def _scan(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
     if not p["length"] and len(eqn.outvars) > many:
         raise Unsupported("scan", "of no steps with outputs")
     order = range(p["length"])[:: -1 if p["reverse"] else 1]
-    outputs: dict[int, list[Array]] = {}
+    outputs: dict[int, list[NodeArray]] = {}
     for i in order:
         outs = inline_program(graph, p["jaxpr"], [*fixed, *carry, *(as_node_array(row[i]) for row in rows)])
         carry, outputs[i] = outs[:many], outs[many:]

@@ -3,7 +3,7 @@
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from diffabs.compiler.ir import Array, Graph, Node, is_real
+from diffabs.compiler.ir import Graph, Node, NodeArray, is_real
 from diffabs.compiler.lower.rules import Unsupported, lowering_rule, map_entries
 from diffabs.core.types import Equation
 
@@ -13,7 +13,7 @@ from diffabs.core.types import Equation
 )
 @lowering_rule("div sub is_finite floor ceil eq ne lt le gt ge pow", "accuracy")
 @lowering_rule("add add_any mul", "out_dtype")
-def _elementwise(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
+def _elementwise(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
     name = eqn.primitive.name.removesuffix("_any")
     if eqn.params.get("accuracy") is not None:
         raise Unsupported(name, f"an accuracy is asked of it: {eqn.params['accuracy']}")
@@ -27,7 +27,7 @@ def _elementwise(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("lt_to le_to")
-def _total_order(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
+def _total_order(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
     """Compare in the total order of sorting and searching: -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
     integer = np.dtype(f"i{eqn.invars[0].aval.dtype.itemsize}")
 
@@ -61,12 +61,12 @@ def _integer_quotient(graph: Graph, x: Node, y: Node) -> Node:
 @lowering_rule("stop_gradient copy copy_p optimization_barrier pvary")
 @lowering_rule("name", "name")
 @lowering_rule("reshard", "dst_sharding concrete_mesh")
-def _identity(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _identity(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     return ins
 
 
 @lowering_rule("max min")
-def _max_min(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _max_min(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     """Return the larger or smaller of two arrays, entry by entry; NaN if either is NaN."""
     return [map_entries(lambda x, y: max_or_min(graph, eqn.primitive.name, x, y), *ins)]
 
@@ -81,7 +81,7 @@ def max_or_min(graph: Graph, name: str, x: Node, y: Node) -> Node:
 
 
 @lowering_rule("sign")
-def _sign(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _sign(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     """Return the sign; NaN, 0 and -0 stay themselves."""
 
     def sign(x: Node) -> Node:
@@ -94,12 +94,12 @@ def _sign(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("square")
-def _square(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _square(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     return [map_entries(lambda x: graph.op("mul", x, x), *ins)]
 
 
 @lowering_rule("integer_pow", "y")
-def _integer_pow(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _integer_pow(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     def power(x: Node) -> Node:
         # Binary powers as in XLA. A negative exponent inverts the final product.
         n, result = abs(eqn.params["y"]), None
@@ -115,7 +115,7 @@ def _integer_pow(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("rsqrt logistic", "accuracy")
-def _rsqrt_or_logistic(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _rsqrt_or_logistic(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     if eqn.params["accuracy"] is not None:
         raise Unsupported(eqn.primitive.name, f"an accuracy is asked of it: {eqn.params['accuracy']}")
 
@@ -129,7 +129,7 @@ def _rsqrt_or_logistic(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Ar
 
 
 @lowering_rule("rem")
-def _rem(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _rem(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     # A constant divisor other than 0 and -1 needs no guard.
     divisors = ins[1].flat
     if ins[1].size and not is_real(divisors[0].dtype) and any(x.op != "const" or x.attr in (0, -1) for x in divisors):
@@ -151,7 +151,7 @@ def _integer_remainder(graph: Graph, x: Node, y: Node) -> Node:
 
 
 @lowering_rule("round", "rounding_method")
-def _round(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _round(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     if eqn.params["rounding_method"].name == "TO_NEAREST_EVEN":
         return [map_entries(lambda x: graph.op("rint", x), *ins)]
 
@@ -168,7 +168,7 @@ def _round(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("select_n")
-def _select(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
+def _select(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
     condition, *cases = ins
     if len(cases) != 2 or eqn.invars[0].aval.dtype != bool:
         raise Unsupported("select_n", f"between {len(cases)} cases")
@@ -176,25 +176,25 @@ def _select(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("clamp")
-def _clamp(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _clamp(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     low, x, high = ins
     return [map_entries(lambda a, b, c: max_or_min(graph, "min", max_or_min(graph, "max", a, b), c), low, x, high)]
 
 
 @lowering_rule("convert_element_type", "new_dtype weak_type sharding")
-def _convert(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _convert(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     return [map_entries(lambda x: graph.convert(x, eqn.params["new_dtype"]), *ins)]
 
 
 @lowering_rule("bitcast_convert_type", "new_dtype")
-def _bits(graph: Graph, eqn: Equation, ins: list[Array]) -> list[Array]:
+def _bits(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
     if eqn.invars[0].aval.dtype.itemsize != np.dtype(eqn.params["new_dtype"]).itemsize:
         raise Unsupported("bitcast_convert_type", "between types of different sizes")
     return [map_entries(lambda x: graph.bits(x, eqn.params["new_dtype"]), *ins)]
 
 
 @lowering_rule("shift_left shift_right_logical")
-def _shift(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _shift(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     """Shift by a number of bits; a shift by the width or more gives 0, where C leaves it undefined."""
     name = eqn.primitive.name
 
@@ -214,7 +214,7 @@ def _shift(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("population_count")
-def _population_count(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _population_count(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     """Count the bits that are set: sums of pairs, of fours and of eights, then a product that adds the four bytes."""
 
     def count(x: Node) -> Node:

@@ -7,7 +7,7 @@ the same for all lanes becomes a table instead.
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from diffabs.compiler.ir import Array, Graph, Node, UpdateLevel
+from diffabs.compiler.ir import Graph, Node, NodeArray, UpdateLevel
 from diffabs.compiler.lower.elementwise import max_or_min
 from diffabs.compiler.lower.rules import Unsupported, as_node_array, lowering_rule, map_entries
 from diffabs.core.types import PyTree
@@ -22,14 +22,14 @@ def _clamp_index(graph: Graph, index: Node, last: int) -> Node:
 
 
 @lowering_rule("dynamic_slice", "slice_sizes")
-def _dynamic_slice(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _dynamic_slice(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     x, places = ins[0], [place.item() for place in ins[1:]]
     for axis, (size, place) in enumerate(zip(eqn.params["slice_sizes"], places, strict=True)):
         x = _part(graph, x, axis, place, size)
     return [x]
 
 
-def _part(graph: Graph, x: Array, axis: int, place: Node, size: int) -> Array:
+def _part(graph: Graph, x: NodeArray, axis: int, place: Node, size: int) -> NodeArray:
     """Return `size` entries along an axis from index `place`, which is clamped so that they lie inside."""
     last = x.shape[axis] - size
     if last == 0:
@@ -51,7 +51,7 @@ def _entry(graph: Graph, index: Node, column: tuple[Node, ...]) -> Node:
 
 
 @lowering_rule("gather", "dimension_numbers slice_sizes indices_are_sorted unique_indices mode fill_value")
-def _gather(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _gather(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     """Return x[i] along the first axis for each index i."""
     x, places = ins
     n, p = eqn.params["dimension_numbers"], eqn.params
@@ -73,7 +73,7 @@ def _gather(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("dynamic_update_slice")
-def _dynamic_update(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _dynamic_update(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     x, new, places = ins[0], ins[1], [place.item() for place in ins[2:]]
     for axis, place in enumerate(places):
         _check_writable(eqn, x.shape[axis] if new.shape[axis] != x.shape[axis] and place.op != "const" else 0)
@@ -92,7 +92,7 @@ def _dynamic_update(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array
 
 
 @lowering_rule("scatter", "dimension_numbers indices_are_sorted mode unique_indices update_consts update_jaxpr")
-def _scatter(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _scatter(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     """Return x.at[i].set(value) for one index i along the first axis.
 
     An index outside of the array changes nothing, or is clamped in the mode CLIP.

@@ -14,7 +14,6 @@ from jax.extend.core import JaxprEqn
 from jax.typing import DTypeLike
 
 from diffabs.compiler.ir import Graph, Node, UpdateLevel
-from diffabs.core.types import PyTree
 
 PACKAGE = pathlib.Path(__file__).parents[2]
 INTERNAL_PATHS = (pathlib.Path(jax.__file__).parent, *(PACKAGE / name for name in ("core", "compiler", "export")))
@@ -42,7 +41,7 @@ class Labelled(Graph):
         self._label = self.labels.get(id(eqn), self._label)
 
     def _make(
-        self, op: str, args: tuple[Node, ...], dtype: DTypeLike, attr: PyTree = None, level: UpdateLevel | None = None
+        self, op: str, args: tuple[Node, ...], dtype: DTypeLike, attr: object = None, level: UpdateLevel | None = None
     ) -> Node:
         node = super()._make(op, args, dtype, attr, level)
         # Equal nodes are one, so the first use names it.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from diffabs.compiler.ir import Array, Graph, Node
+from diffabs.compiler.ir import Graph, Node, NodeArray
 from diffabs.compiler.lower.rules import Unsupported, constant_array, inline_program, lowering_rule, map_entries
 
 MAX_NUMBERS_PER_DRAW = 16  # bound on the size of a draw, because each hash is inlined with about 120 operations
@@ -31,13 +31,13 @@ def key_shape(aval: Any) -> tuple[tuple[int, ...], np.dtype]:
 
 @lowering_rule("random_wrap", "impl")
 @lowering_rule("random_unwrap")
-def _wrap_key(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _wrap_key(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     key_shape((eqn.outvars if eqn.primitive.name == "random_wrap" else eqn.invars)[0].aval)
     return ins
 
 
 @lowering_rule("random_fold_in")
-def _fold_in(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _fold_in(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     if key_shape(eqn.invars[0].aval)[0] != (2,) or ins[1].ndim:
         raise Unsupported("random_fold_in", "of several keys")
     fold = jer.threefry_prng_impl.fold_in
@@ -46,7 +46,7 @@ def _fold_in(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("random_bits", "bit_width shape")
-def _bits(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _bits(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     width, shape = eqn.params["bit_width"], eqn.params["shape"]
     if key_shape(eqn.invars[0].aval)[0] != (2,) or math.prod(shape) > MAX_NUMBERS_PER_DRAW:
         raise Unsupported("random_bits", f"of {math.prod(shape)} numbers at once, or of several keys")
@@ -56,14 +56,14 @@ def _bits(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
 
 
 @lowering_rule("iota_2x32_shape", "shape")
-def _iota_words(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _iota_words(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     """Return the index of each entry in the flattened array as two arrays of 32-bit words, high words first."""
     places = np.arange(math.prod(eqn.params["shape"]), dtype=np.uint32).reshape(eqn.params["shape"])
     return [constant_array(graph, 0 * places), constant_array(graph, places)]
 
 
 @lowering_rule("threefry2x32")
-def _threefry(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _threefry(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     """Return the two words of Threefry-2x32 with 20 rounds, entry by entry.
 
     Source: Salmon, Moraes, Dror and Shaw, Parallel random numbers: as easy as 1, 2, 3 (2011).
@@ -127,7 +127,7 @@ ERF_INV_DOUBLE = (
 
 
 @lowering_rule("erf_inv", "accuracy")
-def _erf_inv(graph: Graph, eqn: JaxprEqn, ins: list[Array]) -> list[Array]:
+def _erf_inv(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
     return [map_entries(lambda x: erf_inv(graph, x), *ins)]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 from jax.typing import DTypeLike
 
-from diffabs.compiler.ir import Array, Graph, Node
+from diffabs.compiler.ir import Graph, Node, NodeArray
 from diffabs.core.types import PyTree, Scalar
 
 JAX = pathlib.Path(jax.__file__).parent
@@ -49,7 +49,7 @@ class LoweringRule(NamedTuple):
         parameters: Names of the parameters that the primitive may have; another one is refused.
     """
 
-    apply: Callable[[Graph, PyTree, list[Array]], Sequence[Array]]
+    apply: Callable[[Graph, PyTree, list[NodeArray]], Sequence[NodeArray]]
     parameters: frozenset[str]
 
 
@@ -69,11 +69,13 @@ def lowering_rule(names: str, parameters: str = "") -> Callable[[PyTree], PyTree
     return decorate
 
 
-def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Sequence[Array]) -> list[Array]:
+def lower_jaxpr(
+    graph: Graph, jaxpr: Any, constants: Sequence[NodeArray], inputs: Sequence[NodeArray]
+) -> list[NodeArray]:
     """Lower a jaxpr to a graph and return its outputs as arrays of nodes."""
     arrays = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
-    def read(atom: PyTree) -> Array:
+    def read(atom: object) -> NodeArray:
         if isinstance(atom, jex.Literal):
             return constant_array(graph, atom.val, atom.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
         return arrays[atom]
@@ -107,20 +109,20 @@ def _calling_method(eqn: JaxprEqn) -> str:
     return ""
 
 
-def constant_array(graph: Graph, x: Scalar, dtype: DTypeLike | None = None) -> Array:
+def constant_array(graph: Graph, x: Scalar, dtype: DTypeLike | None = None) -> NodeArray:
     """Return an array of constant nodes."""
     x = np.asarray(x, dtype)
     return map_entries(lambda i: graph.const(x.reshape(-1)[i]), np.arange(x.size).reshape(x.shape))
 
 
-def scalar_array(node: Node) -> Array:
+def scalar_array(node: Node) -> NodeArray:
     """Return a node as an array of shape ()."""
     out = np.empty((), object)
     out[()] = node
     return out
 
 
-def map_entries(function: Callable[..., Node], *arrays: PyTree) -> Array:
+def map_entries(function: Callable[..., Node], *arrays: PyTree) -> NodeArray:
     """Apply a function entry by entry, with broadcasting, and return the array of its results."""
     arrays = np.broadcast_arrays(*arrays) if len(arrays) > 1 else arrays
     out = np.empty(arrays[0].shape, object)
@@ -129,12 +131,12 @@ def map_entries(function: Callable[..., Node], *arrays: PyTree) -> Array:
     return out
 
 
-def inline_program(graph: Graph, program: Any, inputs: Sequence[Array]) -> list[Array]:
+def inline_program(graph: Graph, program: Any, inputs: Sequence[NodeArray]) -> list[NodeArray]:
     """Lower a program (jaxpr, closed or not) that another one calls, and return its outputs as arrays of nodes."""
     jaxpr, constants = (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, ())
     return lower_jaxpr(graph, jaxpr, [constant_array(graph, x) for x in constants], inputs)
 
 
-def as_node_array(x: Scalar) -> Array:
+def as_node_array(x: Node | NodeArray) -> NodeArray:
     """Return `x` itself if it is an array, or a single node as an array of shape ()."""
     return x if isinstance(x, np.ndarray) else scalar_array(x)

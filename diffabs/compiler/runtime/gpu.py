@@ -168,7 +168,7 @@ def _load(code: pathlib.Path, ordinal: int) -> _LoadedCode:
     return _LoadedCode(context, begin, run, blocks * max(1, number.value))
 
 
-def _launch(kernel: Any, blocks: int, threads: int, stream: int, *args: PyTree) -> None:
+def _launch(kernel: object, blocks: int, threads: int, stream: int, *args: PyTree) -> None:
     """Start a kernel on a stream with `blocks` blocks of `threads` threads; `args` are values of ctypes."""
     # cuLaunchKernel takes an array with the address of each argument.
     pointers = (ctypes.c_void_p * len(args))(*(ctypes.addressof(x) for x in args))

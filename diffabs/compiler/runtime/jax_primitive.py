@@ -23,7 +23,7 @@ from jax.interpreters import partial_eval as pe
 from diffabs.compiler.autodiff.jvp import ArrayKey, arrange_arrays
 from diffabs.compiler.ir import UpdateLevel, is_real
 from diffabs.compiler.lane_programs import LanePrograms
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Array, PyTree, Scalar
 
 MAX_TANGENTS_PER_LAUNCH = 8  # directions; more take several launches
 NO_REVERSE_MODE = (
@@ -50,7 +50,7 @@ def _run(*arrays: PyTree, **how: Any) -> list[PyTree]:
 
 
 @run_lanes_primitive.def_abstract_eval
-def _shapes(*arrays: PyTree, lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: frozenset[int]) -> list[PyTree]:
+def _shapes(*arrays: PyTree, lanes: LanePrograms, seeds: object, many: int, as_lanes: frozenset[int]) -> list[PyTree]:
     """Return the shapes and types of the results: (lanes, ...) of values, (lanes, many, ...) of tangents."""
     carry = arrays[len(lanes.value_keys) - len(lanes.functions.types[UpdateLevel.STEP]) : len(lanes.value_keys)]
 
@@ -63,7 +63,7 @@ def _shapes(*arrays: PyTree, lanes: LanePrograms, seeds: PyTree, many: int, as_l
 
 
 def _launch_in_parts(
-    *arrays: PyTree, lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: frozenset[int]
+    *arrays: PyTree, lanes: LanePrograms, seeds: object, many: int, as_lanes: frozenset[int]
 ) -> list[PyTree]:
     """Return the primitive's results from as few launches as MAX_TANGENTS_PER_LAUNCH allows.
 
@@ -80,7 +80,7 @@ def _launch_in_parts(
     def part(first: int) -> list[PyTree]:
         """Return the results of the launch for `each` directions from `first` on."""
 
-        def cut(key: ArrayKey, x: Scalar) -> PyTree:
+        def cut(key: ArrayKey, x: Array) -> PyTree:
             # Tangents of arrays of lanes are (lanes, tangents, ...), of uniform arrays (tangents, ...).
             axis = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
             lacking = max(0, first + each - many)
@@ -213,7 +213,7 @@ def _batching_rule(
 batching.primitive_batchers[run_lanes_primitive] = _batching_rule
 
 
-def _refuse_partial_evaluation(trace: Any, *tracers: Any, **how: Any) -> NoReturn:
+def _refuse_partial_evaluation(trace: object, *tracers: Any, **how: Any) -> NoReturn:
     """Raise ValueError: JAX linearizes the kernel (`jax.grad`, `jax.linearize`), and no reverse mode exists."""
     del trace, tracers, how
     raise ValueError(NO_REVERSE_MODE)

@@ -10,7 +10,6 @@ import hashlib
 import importlib.util
 import pathlib
 import re
-from typing import Any
 
 from diffabs.compiler.runtime import library_cache
 from diffabs.compiler.runtime.toolchain import NATIVE_FOLDER, NoCompiler
@@ -96,7 +95,7 @@ def _compile_cubin(text: str, architecture: str, headers: list[bytes]) -> tuple[
         nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
 
 
-def _part(nvrtc: Any, name: str, program: ctypes.c_void_p) -> bytes:
+def _part(nvrtc: object, name: str, program: ctypes.c_void_p) -> bytes:
     """Return an output of an NVRTC program: "ProgramLog" or "CUBIN" (`name`)."""
     size = ctypes.c_size_t()
     getattr(nvrtc, f"nvrtcGet{name}Size")(program, ctypes.byref(size))

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from diffabs.core.types import Matrix, PyTree, Scalar
+from diffabs.core.types import AnyArray, Array, Bool, Matrix, PyTree, Scalar, Vector
 
 MAX_PATH_STEPS = 600  # steps; the rig with weights over ten decades takes 30 to 90, at 1 kHz up to 340
 CENTRING_DECREMENT = 0.5  # below this decrement the path goes on to the next centre
@@ -65,11 +65,11 @@ class CentralPathState(NamedTuple):
 
     steps: Scalar
     point: PathPoint
-    shift: Scalar
+    shift: Array
     mu: Scalar
     decrement: Scalar
     settled: Scalar
-    stuck: Scalar
+    stuck: Bool
 
 
 class LocalProblem(NamedTuple):
@@ -77,7 +77,7 @@ class LocalProblem(NamedTuple):
 
     c: Scalar
     b: Scalar
-    k: Scalar
+    k: Vector
     q: Matrix
     r: Any
     w: Scalar
@@ -193,13 +193,13 @@ def _newton(problem: GuaranteedCostProblem, path: CentralPathState, *, discrete:
     return PathPoint(t @ jnp.linalg.cholesky(x), k + best * g @ jnp.linalg.inv(t @ x)), decrement
 
 
-def _phi(local: LocalProblem, y: Scalar, g: Matrix, shift: Scalar, mu: Scalar, *, discrete: bool) -> Matrix:
+def _phi(local: LocalProblem, y: Array, g: Matrix, shift: Scalar, mu: Scalar, *, discrete: bool) -> Matrix:
     x = jnp.eye(y.shape[-1]) + y
     inside = logdet(_slacks(local, y, g, shift, discrete=discrete))
     return _trace(jnp.linalg.inv(x) @ local.w) / mu - logdet(x) - jnp.sum(inside, -1)
 
 
-def _slacks(local: LocalProblem, y: Scalar, g: Matrix, shift: Scalar, *, discrete: bool) -> Matrix:
+def _slacks(local: LocalProblem, y: Array, g: Matrix, shift: Scalar, *, discrete: bool) -> Matrix:
     """Return S_i (..., V, n, n), or in discrete time the block matrix (..., V, 2n, 2n) above."""
     x = jnp.eye(y.shape[-1]) + y
     f = local.k @ x + g
@@ -209,7 +209,7 @@ def _slacks(local: LocalProblem, y: Scalar, g: Matrix, shift: Scalar, *, discret
     )
 
 
-def _linear_part(local: LocalProblem, x: Scalar, g: Matrix, *, discrete: bool) -> Matrix:
+def _linear_part(local: LocalProblem, x: Vector, g: Matrix, *, discrete: bool) -> Matrix:
     """Return the part that is linear in (X, G): -He[c X + b G], or [[X, .], [c X + b G, X]]."""
     x = x[..., None, :, :]
     flow = local.c @ x + local.b @ g[..., None, :, :]
@@ -219,7 +219,7 @@ def _linear_part(local: LocalProblem, x: Scalar, g: Matrix, *, discrete: bool) -
     return jnp.concatenate([jnp.concatenate([x, _t(flow)], -1), jnp.concatenate([flow, x], -1)], -2)
 
 
-def _pad_to_block(x: Scalar, n: int, discrete: bool) -> Matrix:
+def _pad_to_block(x: AnyArray, n: int, discrete: bool) -> Matrix:
     """Return x in the first rows and columns of a block matrix, in discrete time only."""
     return jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, n)] * 2) if discrete else x
 

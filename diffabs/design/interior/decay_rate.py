@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from diffabs.core.first_order import first_order
-from diffabs.core.types import Matrix, PyTree, Scalar
+from diffabs.core.types import AnyArray, Array, Matrix, PyTree, Scalar, Vector
 from diffabs.design.interior.central_path import (
     CENTRING_DECREMENT,
     FINAL_CENTRE_STEPS,
@@ -63,7 +63,7 @@ class _DecayPathState(NamedTuple):
     settled: Scalar
 
 
-def certified_decay(gain: Matrix, A: Matrix, B: Matrix, period: Scalar = None) -> Matrix:
+def certified_decay(gain: Matrix, A: Matrix, B: Matrix, period: Scalar | None = None) -> Matrix:
     """Return the largest decay rate [1/s] for which a common P > 0 proves |x| <= c exp(-rate t) at all vertices.
 
         He[P C_i] + 2 rate P <= 0,   C_i'P C_i <= exp(-2 rate period) P,      C_i = A_i + B_i K
@@ -95,7 +95,7 @@ def _least_shift(discrete: bool, closed: Matrix) -> Matrix:
 
 
 @_least_shift.defjvp
-def _least_shift_jvp(discrete: bool, primals: PyTree, tangents: PyTree) -> Matrix:
+def _least_shift_jvp(discrete: bool, primals: PyTree, tangents: PyTree) -> tuple[Array, Array]:
     """Return s and ds = sum <W_i, dL_i(X)>/sum <W_i, X>, in the coordinates where X is the unit matrix."""
     s, T, weights = _follow_path(discrete, *primals)
     c, change = (jnp.linalg.inv(T) @ x @ T for x in (primals[0], first_order(tangents[0], NO_SECOND_DERIVATIVES)))
@@ -150,7 +150,7 @@ def _follow_path(discrete: bool, closed: Matrix) -> tuple[PyTree, PyTree, PyTree
     return path.s + start.decrement, path.T, weights
 
 
-def _step(c: Scalar, path: _DecayPathState, m: Scalar, discrete: bool) -> tuple[PyTree, PyTree, PyTree]:
+def _step(c: AnyArray, path: _DecayPathState, m: Scalar, discrete: bool) -> tuple[PyTree, PyTree, PyTree]:
     """Return T and s after a step, and the decrement before it, NaN if no step is possible; m = M/trace M."""
     vertices, n, _ = c.shape
     degree = (vertices + 1) * n
@@ -192,21 +192,21 @@ def _newton_step_in_plane(gradient: Matrix, hessian: Matrix, normal: Matrix) -> 
     return unit * step, jnp.sqrt(jnp.maximum(step @ hessian @ step, 0.0))
 
 
-def _lyapunov_operator(c: Scalar, x: Scalar, discrete: bool) -> Matrix:
+def _lyapunov_operator(c: AnyArray, x: AnyArray, discrete: bool) -> AnyArray:
     return c @ x @ jnp.swapaxes(c, -1, -2) if discrete else he(c @ x)
 
 
-def _transform_loops(closed: Matrix, T: Matrix) -> Matrix:
+def _transform_loops(closed: AnyArray, T: Matrix) -> Array:
     return jnp.linalg.inv(T) @ closed @ T
 
 
-def _largest_norm(matrices: Scalar) -> Matrix:
+def _largest_norm(matrices: AnyArray) -> Matrix:
     """Return the largest of the vertices' norms; 1 if all are zero."""
     size = jnp.max(jnp.linalg.norm(matrices, axis=(1, 2)))
     return jnp.where(size == 0, 1.0, size)
 
 
-def _balancing_units(size: Scalar) -> Matrix:
+def _balancing_units(size: Vector) -> Matrix:
     """Return units d (n,), x = d z, that give rows and columns of `size` about equal sums without the diagonal."""
     size = size * (1 - jnp.eye(len(size)))
 

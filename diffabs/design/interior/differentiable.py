@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.types import AnyArray, Matrix, PyTree, Scalar
+from diffabs.core.types import AnyArray, Array, Matrix, PyTree, Scalar
 from diffabs.design.interior import central_path
 from diffabs.design.interior.central_path import CentralPathState, GuaranteedCostProblem, PathPoint
 from diffabs.design.polytopes import Polytope
@@ -83,14 +83,16 @@ def _solve_central_path(discrete: bool, problem: GuaranteedCostProblem) -> tuple
 
 
 @_solve_central_path.defjvp
-def _solve_central_path_jvp(discrete: bool, primals: PyTree, tangents: PyTree) -> Matrix:
+def _solve_central_path_jvp(
+    discrete: bool, primals: PyTree, tangents: PyTree
+) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
     """Return the implicit derivative: H dx + d(gradient of phi at constant x) = 0, in the coordinates of the point."""
     (problem,), (change,) = primals, tangents
     K, P, mu = _solve_central_path(discrete, problem)
     # T from P: the primal's own T is no output, and any T with T T' = P^-1 gives the same derivative.
     T = jnp.linalg.inv(jnp.linalg.cholesky(P).T)
 
-    def gradient(problem: GuaranteedCostProblem) -> Matrix:
+    def gradient(problem: GuaranteedCostProblem) -> tuple[Array, Array]:
         return central_path.gradient_and_hessian(
             central_path.localise_problem(problem, PathPoint(T, K)), 0.0, mu, discrete=discrete
         )
@@ -107,7 +109,7 @@ def _start_from_riccati(problem: GuaranteedCostProblem, discrete: bool) -> Centr
     """Return the Riccati solution of the vertex with the smallest shift; NaN if one vertex has no solution."""
     A, B, Q, R = problem
 
-    def alone(a: Scalar, b: Scalar) -> tuple[PyTree, PathPoint, PyTree]:
+    def alone(a: Matrix, b: Matrix) -> tuple[PyTree, PathPoint, PyTree]:
         """Return the shift, the point and trace P of one vertex's Riccati solution."""
         P = (dare if discrete else care)(a, b, Q, R).P
         K = -jnp.linalg.solve(R + b.T @ P @ b, b.T @ P @ a) if discrete else -jnp.linalg.solve(R, b.T @ P)

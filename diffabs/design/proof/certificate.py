@@ -26,7 +26,7 @@ from types import MappingProxyType
 import numpy as np
 
 from diffabs.core.numerics import spectral_bound
-from diffabs.core.types import Matrix, Params, PyTree, Scalar
+from diffabs.core.types import Params, PyTree
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof import exact, schema, serialise
 from diffabs.runtime import files
@@ -300,26 +300,30 @@ class Certificate:
             raise ValueError(f"{os.fspath(path)}: {' '.join(str(error).split())}") from None
 
 
-def as_read_only_array(value: Scalar) -> np.ndarray:
+def as_read_only_array(value: object) -> np.ndarray:
     """Return a copy as floats that cannot be written to."""
     array = np.array(value, float)
     array.setflags(write=False)
     return array
 
 
-def as_read_only_system(system: Polytope | Schedule) -> Matrix:
+def as_read_only_system(system: Polytope | Schedule) -> Polytope | Schedule:
     """Return a copy whose arrays cannot be written to."""
     if isinstance(system, Schedule):
-        copy = dataclasses.replace(system, cells=tuple(map(as_read_only_system, system.cells)))
+        copy = dataclasses.replace(system, cells=tuple(map(_as_read_only_polytope, system.cells)))
         copy.nodes.setflags(write=False)
         return copy
+    return _as_read_only_polytope(system)
+
+
+def _as_read_only_polytope(system: Polytope) -> Polytope:
     copy = dataclasses.replace(system)
     copy.A.setflags(write=False)
     copy.B.setflags(write=False)
     return copy
 
 
-def round_up(value: Scalar) -> float:
+def round_up(value: Fraction | float) -> float:
     """Return the smallest float that is not below a rational number."""
     near = float(value)
     return near if Fraction(near) >= value else math.nextafter(near, math.inf)

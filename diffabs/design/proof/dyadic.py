@@ -14,7 +14,7 @@ import numpy as np
 from diffabs.core.types import PyTree, Scalar
 
 RELATIVE_ERROR_BITS = 40  # a relative error of 2^-40 covers the rounding in computing the matrices from a model
-Matrix = Any  # an array of floats, or Dyadic
+Exact = Any  # an array of floats, or Dyadic
 
 
 class Dyadic:
@@ -26,7 +26,7 @@ class Dyadic:
     __slots__ = ("bits", "error", "ints")
     __array_ufunc__ = None  # makes NumPy leave array * Dyadic to __rmul__ instead of an element-wise product
 
-    def __init__(self, ints: Matrix, bits: int, error: Scalar = None) -> None:
+    def __init__(self, ints: Exact, bits: int, error: object = None) -> None:
         """Store `ints`, `bits` and `error` unchanged; `as_dyadic` and `as_uncertain_dyadic` convert floats."""
         self.ints, self.bits, self.error = ints, bits, error
 
@@ -49,7 +49,7 @@ class Dyadic:
         finer = bits - self.bits
         return self.each(lambda array: array * (1 << finer), finer) if finer else self
 
-    def product(self, other: Matrix, times: Callable[[PyTree, PyTree], PyTree]) -> "Dyadic":
+    def product(self, other: Exact, times: Callable[[PyTree, PyTree], PyTree]) -> "Dyadic":
         """Return the product with `other` by the bilinear `times`, with its error |a| db + da |b| + da db."""
         other = as_dyadic(other)
         a, b, da, db = self.ints, other.ints, self.error, other.error
@@ -58,26 +58,26 @@ class Dyadic:
         errors += [] if da is None or db is None else [times(da, db)]
         return Dyadic(times(a, b), self.bits + other.bits, functools.reduce(operator.add, errors) if errors else None)
 
-    def __add__(self, other: Matrix) -> "Dyadic":
+    def __add__(self, other: Exact) -> "Dyadic":
         other = as_dyadic(other)
         bits = max(self.bits, other.bits)
         a, b = self.at(bits), other.at(bits)
-        errors = [each.error for each in (a, b) if each.error is not None]
+        errors: list[Any] = [each.error for each in (a, b) if each.error is not None]
         return Dyadic(a.ints + b.ints, bits, functools.reduce(operator.add, errors) if errors else None)
 
-    def __mul__(self, other: Matrix) -> "Dyadic":
+    def __mul__(self, other: Exact) -> "Dyadic":
         return self.product(other, operator.mul)
 
-    def __matmul__(self, other: Matrix) -> "Dyadic":
+    def __matmul__(self, other: Exact) -> "Dyadic":
         return self.product(other, operator.matmul)
 
     def __neg__(self) -> "Dyadic":
         return Dyadic(-self.ints, self.bits, self.error)
 
-    def __sub__(self, other: Matrix) -> "Dyadic":
+    def __sub__(self, other: Exact) -> "Dyadic":
         return self + -as_dyadic(other)
 
-    def __rsub__(self, other: Matrix) -> "Dyadic":
+    def __rsub__(self, other: Exact) -> "Dyadic":
         return -self + other
 
     def __getitem__(self, index: object) -> "Dyadic":

@@ -23,7 +23,7 @@ import numpy as np
 
 from diffabs.core.types import Params, PyTree
 from diffabs.design.polytopes import Polytope, Schedule
-from diffabs.design.proof.dyadic import Dyadic, Matrix, as_dyadic, as_uncertain_dyadic, is_positive_definite
+from diffabs.design.proof.dyadic import Dyadic, Exact, as_dyadic, as_uncertain_dyadic, is_positive_definite
 from diffabs.design.proof.schema import check_claim
 
 
@@ -34,7 +34,7 @@ class Inequality(NamedTuple):
     ALL_VERTICES if the inequality concerns all vertices together, and None for a side condition such as P > 0.
     """
 
-    terms: tuple[Matrix, ...]
+    terms: tuple[Exact, ...]
     vertex: int | None = None
     strict: bool = True
 
@@ -45,22 +45,22 @@ ALL_VERTICES = -1
 class ClosedLoop(NamedTuple):
     """Gain K and closed loops C of the vertices, as floats or Dyadic."""
 
-    K: Matrix
-    C: Matrix
+    K: Exact
+    C: Exact
     discrete: bool
 
 
-def he(M: Matrix) -> Matrix:
+def he(M: Exact) -> Exact:
     """Return M + M'."""
     return M + M.mT
 
 
-def block_matrix(rows: list[list[Matrix]]) -> Matrix:
+def block_matrix(rows: list[list[Exact]]) -> Exact:
     """Return the block matrix of the rows; blocks without leading axes are the same for every vertex."""
     flat = [each for row in rows for each in row]
     lead = np.broadcast_shapes(*(each.shape[:-2] for each in flat))
 
-    def join_blocks(get: Callable[[Matrix], PyTree]) -> Matrix:
+    def join_blocks(get: Callable[[Exact], PyTree]) -> Exact:
         return np.block([[np.broadcast_to(get(each), (*lead, *each.shape[-2:])) for each in row] for row in rows])
 
     if not isinstance(flat[0], Dyadic):
@@ -75,7 +75,7 @@ def block_matrix(rows: list[list[Matrix]]) -> Matrix:
     )
 
 
-def decrease_terms(loop: ClosedLoop, P: Matrix, data: Mapping[str, Matrix]) -> tuple[Matrix, ...]:
+def decrease_terms(loop: ClosedLoop, P: Exact, data: Mapping[str, Exact]) -> tuple[Exact, ...]:
     """Return the terms of -He(P C) - 2 rate P, or in discrete time of factor^2 P - C' P C."""
     if loop.discrete:
         factor = data.get("factor", 1)
@@ -83,13 +83,13 @@ def decrease_terms(loop: ClosedLoop, P: Matrix, data: Mapping[str, Matrix]) -> t
     return -he(P @ loop.C), -2 * data.get("rate", 0) * P
 
 
-def decay_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def decay_conditions(loop: ClosedLoop, data: Mapping[str, Exact]) -> Iterator[Inequality]:
     """Yield the conditions that V = x' P x falls at least like exp(-2 rate t), or by factor^2 a period."""
     yield Inequality((data["P"],))
     yield Inequality(decrease_terms(loop, data["P"], data), 0)
 
 
-def cost_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def cost_conditions(loop: ClosedLoop, data: Mapping[str, Exact]) -> Iterator[Inequality]:
     """Yield the conditions for V' <= -x' (Q + K' R K) x.
 
     The integral (sum) of x' (Q + K' R K) x from x0 is then at most x0' P x0. A further condition is that V falls,
@@ -102,7 +102,7 @@ def cost_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[In
     yield Inequality((*terms, -data["Q"], -(loop.K.mT @ data["R"] @ loop.K)), 0)
 
 
-def damping_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def damping_conditions(loop: ClosedLoop, data: Mapping[str, Exact]) -> Iterator[Inequality]:
     """Yield the conditions for a damping of at least zeta, with M = P C and cot >= zeta / sqrt(1 - zeta^2).
 
         -[[He(M), cot (M - M')], [cot (M' - M), He(M)]] > 0
@@ -116,7 +116,7 @@ def damping_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator
     yield Inequality((-block_matrix([[he(M), skew], [skew.mT, he(M)]]),), 0)
 
 
-def l2_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def l2_conditions(loop: ClosedLoop, data: Mapping[str, Exact]) -> Iterator[Inequality]:
     """Yield the conditions for V' + |z|^2 - gamma^2 |w|^2 < 0: the gain from w to z is below gamma.
 
     This is the bounded real lemma, x' = C x + Bw w and z = (C + D K) x with C and D of the claim. In discrete time V'
@@ -134,7 +134,7 @@ def l2_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Ineq
         yield Inequality((block_matrix([[-he(P @ loop.C) - Z.mT @ Z, cross], [cross.mT, supply]]),), 0)
 
 
-def input_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def input_conditions(loop: ClosedLoop, data: Mapping[str, Exact]) -> Iterator[Inequality]:
     """Yield the conditions for |u_j| <= limit_j for ever from the hull of `points`.
 
     The points lie in {x' P x <= 1}, which no trajectory leaves. There (K_j x)^2 <= K_j P^-1 K_j' < limit_j^2, by [[P,
@@ -150,7 +150,7 @@ def input_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[I
         yield Inequality((block_matrix([[P, row.mT], [row, limit[j] * limit[j] * np.eye(1)]]),))
 
 
-def infeasibility_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def infeasibility_conditions(loop: ClosedLoop, data: Mapping[str, Exact]) -> Iterator[Inequality]:
     """Yield the conditions that no P > 0 has He(P (C_i + rate I)) <= 0 at all vertices.
 
     They are W_i >= 0 and S = sum_i He((C_i + rate I) W_i) > 0. Such a P gives the contradiction 0 >= sum_i tr(W_i He(P
@@ -165,7 +165,7 @@ def infeasibility_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> It
     yield Inequality(tuple(S[i] for i in range(W.shape[0])), ALL_VERTICES)
 
 
-def instability_conditions(loop: ClosedLoop, data: Mapping[str, Matrix], vertex: int) -> Iterator[Inequality]:
+def instability_conditions(loop: ClosedLoop, data: Mapping[str, Exact], vertex: int) -> Iterator[Inequality]:
     """Yield the conditions that the loop at one vertex falls slower than exp(-rate t), or `factor` a period.
 
     They are He(P C) + 2 rate P <= 0 and x'P x < 0. From x on, V = x'P x is at most V(0) exp(-2 rate t), so it stays
@@ -178,7 +178,7 @@ def instability_conditions(loop: ClosedLoop, data: Mapping[str, Matrix], vertex:
 
 
 def schedule_conditions(
-    cells: list[tuple[Matrix, Matrix]], nodes: Matrix, gain: Matrix, data: Mapping[str, Matrix]
+    cells: list[tuple[Exact, Exact]], nodes: Exact, gain: Exact, data: Mapping[str, Exact]
 ) -> Iterator[Inequality]:
     """Yield the conditions for V = x' P(p) x with V' <= -2 rate V - x' (Q + K' R K) x.
 
@@ -221,7 +221,7 @@ CLAIM_CONDITIONS = {
 }
 
 
-def conditions(kind: str, system: Polytope | Schedule, gain: Matrix, data: Params, proof: bool) -> Iterator[Inequality]:
+def conditions(kind: str, system: Polytope | Schedule, gain: Exact, data: Params, proof: bool) -> Iterator[Inequality]:
     """Yield the inequalities of a claim, with `proof` in exact numbers with errors of the vertices, else in floats."""
     check_claim(kind, system, gain, data)
     # The gain, P and the bounds are exact as stored; only the system's matrices come from a computation with rounding.
@@ -270,12 +270,12 @@ def is_robustly_positive(matrix: np.ndarray, error: np.ndarray, bits: int) -> bo
     return is_positive_definite(rows)
 
 
-def is_proved(kind: str, system: Polytope | Schedule, gain: Matrix, data: Params) -> bool:
+def is_proved(kind: str, system: Polytope | Schedule, gain: Exact, data: Params) -> bool:
     """Return whether a claim is proved, exactly and rounded outward."""
     return all(map(is_satisfied, conditions(kind, system, gain, data, proof=True)))
 
 
-def vertex_margins(kind: str, system: Polytope | Schedule, gain: Matrix, data: Params) -> dict[int, float]:
+def vertex_margins(kind: str, system: Polytope | Schedule, gain: Exact, data: Params) -> dict[int, float]:
     """Return for each vertex the smallest eigenvalue of a claim's inequality relative to its largest term, in floats.
 
     The margin of an inequality about all vertices together has the key ALL_VERTICES. Side conditions are left out.

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from diffabs.core.types import Matrix, Params, PyTree, Scalar
+from diffabs.core.types import Params, PyTree
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.runtime import files
 
@@ -34,7 +34,7 @@ def reject_duplicate_names(pairs: list[tuple[str, PyTree]]) -> dict[str, PyTree]
     return members
 
 
-def read_members(value: Scalar, where: str, *names: str) -> list[PyTree]:
+def read_members(value: object, where: str, *names: str) -> list[PyTree]:
     """Return the values of an object with exactly these members, in the order of `names`."""
     if not isinstance(value, dict) or set(value) != set(names):
         has = ", ".join(value) if isinstance(value, dict) else type(value).__name__
@@ -42,14 +42,14 @@ def read_members(value: Scalar, where: str, *names: str) -> list[PyTree]:
     return [value[name] for name in names]
 
 
-def read_list(value: Scalar, where: str, kind: type = dict) -> list[PyTree]:
+def read_list(value: object, where: str, kind: type = dict) -> list[PyTree]:
     """Return a list of JSON values of one type, after a check."""
     if not isinstance(value, list) or not all(type(each) is kind for each in value):
         raise ValueError(f"{where} must be a list of {kind.__name__}")
     return value
 
 
-def read_numbers(value: Scalar, where: str = "a number") -> Matrix:
+def read_numbers(value: object, where: str = "a number") -> np.ndarray:
     """Return a finite number, or lists of them of equal lengths, as an array; integers are read as floats."""
     array = np.array(value, object)
     if not all(type(each) is float and math.isfinite(each) for each in array.flat):
@@ -92,7 +92,7 @@ def read_certificate(
     )
 
 
-def certificate_from_json(value: Scalar) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, PyTree]]]]:
+def certificate_from_json(value: object) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, PyTree]]]]:
     """Return system, gain, and (kind, data) of the claims in a JSON value."""
     kind, version, system, gain, claims = read_members(
         value, "the file", "format", "version", "system", "gain", "claims"
@@ -112,7 +112,7 @@ def certificate_from_json(value: Scalar) -> tuple[Polytope | Schedule, np.ndarra
     return read_system(system), read_numbers(gain, "gain"), pairs
 
 
-def read_system(value: Scalar) -> Polytope | Schedule:
+def read_system(value: object) -> Polytope | Schedule:
     """Return a polytope or a schedule from a JSON value."""
     if isinstance(value, dict) and "cells" in value:
         parameter, nodes, cells = read_members(value, "system", "parameter", "nodes", "cells")
@@ -125,7 +125,7 @@ def read_system(value: Scalar) -> Polytope | Schedule:
     return read_polytope(value, "system")
 
 
-def read_polytope(value: Scalar, where: str) -> Polytope:
+def read_polytope(value: object, where: str) -> Polytope:
     """Return a polytope from a JSON value, without corners: nothing ties such labels of a file to its matrices."""
     A, B, period, states, _ = read_members(value, where, "A", "B", "period", "states", "corners")
     if period is not None and not (isinstance(period, float) and 0 < period < math.inf):

@@ -13,11 +13,14 @@ import functools
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from diffabs.core.types import Part, PyTree, Scalar
+if TYPE_CHECKING:
+    from cvxpy import Parameter, Problem, Variable
+
+from diffabs.core.types import Part, PyTree
 
 SOLVERS = ("CLARABEL", "MOSEK", "CVXOPT")  # in order of preference; SCS has errors of 1e-3 and is not used
 OPTIONS = {"CLARABEL": {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}}
@@ -166,11 +169,11 @@ def solve_sdp(c: np.ndarray, blocks: list[SdpBlock], solver: str = "CLARABEL") -
 
 
 class _Program(NamedTuple):
-    problem: Part
-    y: Scalar
-    cost: Scalar
-    h: list[PyTree]
-    g: list[PyTree]
+    problem: "Problem"
+    y: "Variable"
+    cost: "Parameter"
+    h: "list[Parameter]"
+    g: "list[Parameter]"
     constraints: list[list[PyTree]]
 
 

@@ -104,7 +104,7 @@ def run_deferred(by_xla: Callable[[Any, PyTree], PyTree], capacity: Any, run: Py
 
 
 @functools.lru_cache(MAX_KEPT_PROGRAMS)
-def _result_shape(structure: Any, kinds: tuple[Any, ...], finish: Finish, leaves: tuple[Any, ...]) -> PyTree:
+def _result_shape(structure: object, kinds: tuple[Any, ...], finish: Finish, leaves: tuple[Any, ...]) -> PyTree:
     """Return the result of one run as shapes: that of a run which is over before its first step."""
 
     def finish_at_start(*leaves: PyTree) -> PyTree:
@@ -116,7 +116,7 @@ def _result_shape(structure: Any, kinds: tuple[Any, ...], finish: Finish, leaves
     return jax.tree.map(_type, jax.eval_shape(finish_at_start, *leaves))
 
 
-def _rebuild(structure: Any, kinds: tuple[Any, ...], leaves: Leaves) -> tuple[PyTree, PyTree, PyTree, PyTree]:
+def _rebuild(structure: object, kinds: tuple[Any, ...], leaves: Leaves) -> tuple[PyTree, PyTree, PyTree, PyTree]:
     """Return (loop, objectives, method, key) of the leaves, whose random keys are words."""
     pairs = zip(leaves, kinds, strict=True)
     return jax.tree.unflatten(
@@ -410,11 +410,11 @@ def _differentiate_twice(primals: Leaves, tangents: Leaves, **named: Any) -> tup
     return _push_forward(call.vectorize(call.deferred.call_xla), primals, places, [tangents[i] for i in places])
 
 
-def _has_real_tangent(x: PyTree, tangent: PyTree) -> bool:
+def _has_real_tangent(x: object, tangent: object) -> bool:
     return type(tangent) is not ad.Zero and _is_real(x)
 
 
-def _zero(x: PyTree) -> ad.Zero:
+def _zero(x: object) -> ad.Zero:
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
@@ -492,7 +492,7 @@ def _input_shapes(call: _Call, leaves: Leaves) -> list[tuple[int, ...]]:
     return [leaves[i].shape[sum(level[i] for level in call.levels) :] for i in call.tangent_leaves or ()]
 
 
-def _has_tangent(x: PyTree) -> bool:
+def _has_tangent(x: object) -> bool:
     """Return whether a derivative around this one has a tangent of x: then the Jacobian is differentiated, by XLA."""
     while isinstance(x, Tracer):
         # JAX exports no classes of its tracers: those of derivatives have `tangent` and `primal`, that of vmap `val`.

@@ -51,7 +51,7 @@ class EngineError(ValueError):
     """The requested engine is not possible."""
 
     @classmethod
-    def of(cls, line: Any) -> "EngineError":
+    def of(cls, line: object) -> "EngineError":
         """Return the error for a kernel that is impossible for the reason `line`."""
         return cls(f"engine = 'kernel' is not possible: {line}")
 
@@ -90,7 +90,7 @@ def run_with_engine(
     engine: str,
     native: Callable[[], T],
     otherwise: Callable[[], T],
-    data: PyTree,
+    data: object,
     why_not: str = "",
     why_xla: str = "",
 ) -> T:

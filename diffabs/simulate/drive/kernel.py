@@ -8,7 +8,6 @@ room for the next one, as in `packed`. The kernel deals the runs to threads of i
 import functools
 import operator
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,7 @@ from diffabs.core.loop import BLOCKS, Loop, LoopState
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero, read_leaves
-from diffabs.core.types import Key, Params, PyTree, Scalar
+from diffabs.core.types import Bool, Key, Params, PyTree, Scalar, Vector
 from diffabs.simulate.arguments import forbid_derivatives, prepare_arguments, refuse_derivative
 from diffabs.simulate.drive.engine import check_process
 from diffabs.simulate.drive.loops import STEPS_PER_BLOCK
@@ -44,7 +43,7 @@ def run_native(
     keys: PyTree,
     solver: Solver,
     objectives: Mapping[str, Objective],
-    accepted: Scalar,
+    accepted: Vector,
     enough: EarlyEnd | None = None,
 ) -> Run:
     """Return the result of `packed.run_packed`, equal to rounding and with forward derivatives.
@@ -74,7 +73,7 @@ def run_native(
     return jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
 
 
-def run_single(loop: Any, objectives: PyTree, method: PyTree, finish: Finish, key: Key | None = None) -> PyTree:
+def run_single(loop: object, objectives: object, method: object, finish: Finish, key: Key | None = None) -> PyTree:
     """Return one run, as `finish` makes it of the last carry; `jax.vmap` makes a lane of each run of a batch.
 
     The errors are those of `run_native`, and a RuntimeError in a process that was forked after JAX had started.
@@ -138,13 +137,13 @@ def _run(
     def start(lane_leaves: PyTree, key: PyTree, accepted: Scalar) -> PyTree:
         return _stop_unaccepted(accepted, method.start(*build_lane(lane_leaves), key))
 
-    def is_running(lane: PyTree, carry: PyTree) -> Scalar:
+    def is_running(lane: PyTree, carry: PyTree) -> Bool:
         if enough is None:
             return carry.running
         output = build_lane(lane[0])[0].plant.output(carry.point.state.plant)
         return carry.running & ~enough.has_reached(lane[2], output)
 
-    def judge(lane_leaves: PyTree, carry: PyTree) -> PyTree:
+    def judge(lane_leaves: object, carry: object) -> PyTree:
         return finish(*build_lane(lane_leaves), carry)[0]
 
     begins = jax.vmap(start)(leaves, keys, accepted)

@@ -11,7 +11,7 @@ capacity.
 
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +20,10 @@ from diffabs.core.lanes import any_lane, rematerialise
 from diffabs.core.types import Array, Bool, Int, PyTree
 
 X = TypeVar("X")
-Carry = Any  # pytree of the stepping method, with an attribute `running`
+
+MethodCarry: TypeAlias = Any  # pytree of the stepping method, with an attribute `running`
 # Function of a carry and, for trajectories, of `until`, the number of the grid instant at which to pause.
-Step = Callable[..., Carry]
+Step = Callable[..., MethodCarry]
 SCAN_GROUP_STEPS = 32  # attempts that are skipped together
 SEGMENT_STEPS = 128  # least number of grid steps that reverse mode computes again together
 MAX_SAVED_CARRIES = 1800  # carries that reverse mode keeps in one scan: some 0.2 MB for each run of a batch
@@ -36,13 +37,13 @@ def round_up_capacity(count: int) -> int:
     return -(-count // unit) * unit
 
 
-def run_to_end(step: Step, renew: Step, carry: Carry) -> Carry:
+def run_to_end(step: Step, renew: Step, carry: MethodCarry) -> MethodCarry:
     """Return the carry at the end of a run, or of a batch under `jax.vmap`. Not for reverse mode.
 
     `renew` is called once before each block of `STEPS_PER_BLOCK` steps.
     """
 
-    def block(carry: Carry) -> Carry:
+    def block(carry: MethodCarry) -> MethodCarry:
         return jax.lax.scan(lambda carry, _: (step(carry), None), renew(carry), length=STEPS_PER_BLOCK)[0]
 
     return jax.lax.while_loop(lambda carry: any_lane(carry.running), block, carry)
@@ -51,13 +52,13 @@ def run_to_end(step: Step, renew: Step, carry: Carry) -> Carry:
 def run_with_trajectory(
     step: Step,
     renew: Step,
-    before: Callable[[Carry, PyTree], PyTree],
-    look: Callable[[Carry, PyTree], PyTree],
-    carry: Carry,
+    before: Callable[[MethodCarry, PyTree], PyTree],
+    look: Callable[[MethodCarry, PyTree], PyTree],
+    carry: MethodCarry,
     every: Any,
     count: Int,
     room: int,
-) -> tuple[Carry, PyTree]:
+) -> tuple[MethodCarry, PyTree]:
     """Return the carry after `count` times `every` steps of the grid, and a sample after each `every`-th step.
 
     `before(carry, i)` is True if the run goes on and has not reached the grid instant i, and `look(carry, i)` is the
@@ -65,10 +66,10 @@ def run_with_trajectory(
     """
     samples = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), jax.eval_shape(look, carry, count))
 
-    def segment(i: Int, at: tuple[Carry, PyTree]) -> tuple[Carry, PyTree]:
+    def segment(i: Int, at: tuple[MethodCarry, PyTree]) -> tuple[MethodCarry, PyTree]:
         until = (i + 1) * every
 
-        def attempt(carry: Carry) -> Carry:
+        def attempt(carry: MethodCarry) -> MethodCarry:
             return step(renew(carry), until=until)
 
         carry = jax.lax.while_loop(lambda carry: any_lane(before(carry, until)), attempt, at[0])
@@ -79,24 +80,24 @@ def run_with_trajectory(
 
 def scan_with_trajectory(
     step: Step,
-    before: Callable[[Carry, PyTree], PyTree],
-    look: Callable[[Carry, PyTree], PyTree],
-    carry: Carry,
+    before: Callable[[MethodCarry, PyTree], PyTree],
+    look: Callable[[MethodCarry, PyTree], PyTree],
+    carry: MethodCarry,
     every: int,
     count: Int,
     instants: int,
     capacity: Callable[[int], int],
-) -> tuple[Carry, PyTree]:
+) -> tuple[MethodCarry, PyTree]:
     """Return what `run_with_trajectory` does, for derivatives. Between two samples there is room as in `scan_steps`.
 
     The samples have a leading axis of `instants`; those beyond `count` come from the final carry. Reverse mode keeps
     the carry at each sample, and computes the steps between two samples again.
     """
 
-    def segment(carry: Carry, i: Int) -> tuple[Carry, PyTree]:
+    def segment(carry: MethodCarry, i: Int) -> tuple[MethodCarry, PyTree]:
         until = (i + 1) * every
 
-        def go_to_sample(carry: Carry) -> Carry:
+        def go_to_sample(carry: MethodCarry) -> MethodCarry:
             return scan_steps(step, before, carry, i * every, until, every, capacity)
 
         # The scan has `instants` rounds, the run only `count`: the rest is skipped, not computed and discarded.
@@ -108,13 +109,13 @@ def scan_with_trajectory(
 
 def scan_steps(
     step: Step,
-    on: Callable[[Carry, PyTree], PyTree],
-    carry: Carry,
+    on: Callable[[MethodCarry, PyTree], PyTree],
+    carry: MethodCarry,
     first: Int,
     last: Int | None,
     steps: int,
     capacity: Callable[[int], int],
-) -> Carry:
+) -> MethodCarry:
     """Return the carry at the grid instant `last`, or at the end of the run, from that at `first`. For derivatives.
 
     There is room for `steps` steps of the grid, and `capacity(n)` is the room for attempts in n of them. `on(carry, i)`
@@ -125,7 +126,7 @@ def scan_steps(
     the instant.
     """
 
-    def go(carry: Carry, until: Int | None, steps: int) -> Carry:
+    def go(carry: MethodCarry, until: Int | None, steps: int) -> MethodCarry:
         return repeat_step(
             lambda carry: step(carry, until=until), carry, capacity(steps), lambda carry: on(carry, until)
         )
@@ -134,7 +135,7 @@ def scan_steps(
         return go(carry, last, steps)
     length = max(SEGMENT_STEPS, math.ceil(steps / MAX_SAVED_CARRIES))
 
-    def segment(carry: Carry, i: Int) -> tuple[Carry, None]:
+    def segment(carry: MethodCarry, i: Int) -> tuple[MethodCarry, None]:
         end = first + (i + 1) * length
         until = end if last is None else jnp.minimum(end, last)
         running = any_lane(jax.lax.stop_gradient(on(carry, until)))
@@ -163,19 +164,19 @@ def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X
 
 
 def log_run(
-    step: Step, renew: Step, log: Callable[[Carry, Carry], PyTree], carry: Carry, room: int
-) -> tuple[Carry, PyTree]:
+    step: Step, renew: Step, log: Callable[[MethodCarry, MethodCarry], PyTree], carry: MethodCarry, room: int
+) -> tuple[MethodCarry, PyTree]:
     """Return the carry at the end of a run, and the entry log(before, after) of each attempt, at least `room` of them.
 
     The log is in blocks of shape (blocks, `STEPS_PER_BLOCK`, ...). Blocks after the end of the run are zero. `renew` is
     called once before each block.
     """
 
-    def attempt(carry: Carry, _: None) -> tuple[Carry, PyTree]:
+    def attempt(carry: MethodCarry, _: None) -> tuple[MethodCarry, PyTree]:
         new = step(carry)
         return new, log(carry, new)
 
-    def block(carry: Carry, _: None) -> tuple[Carry, PyTree]:
+    def block(carry: MethodCarry, _: None) -> tuple[MethodCarry, PyTree]:
         return jax.lax.scan(attempt, renew(carry), length=STEPS_PER_BLOCK)
 
     return _scan_active(
@@ -188,25 +189,25 @@ def log_run(
 
 
 def replay_log(
-    step: Callable[[Carry, PyTree], Carry],
-    keep: Callable[[Carry], PyTree],
+    step: Callable[[MethodCarry, PyTree], MethodCarry],
+    keep: Callable[[MethodCarry], PyTree],
     accepted: Callable[[PyTree], Array],
-    carry: Carry,
-    log: PyTree,
-) -> tuple[Carry, PyTree]:
+    carry: MethodCarry,
+    log: object,
+) -> tuple[MethodCarry, PyTree]:
     """Return the carry after all logged attempts, and keep(carry) after each, in the blocks of the log.
 
     A block in which no attempt is `accepted` is skipped: zeros. Reverse mode keeps the carry before each block, and
     computes the attempts of a block again.
     """
 
-    def attempt(carry: Carry, entry: PyTree) -> tuple[Carry, PyTree]:
+    def attempt(carry: MethodCarry, entry: object) -> tuple[MethodCarry, PyTree]:
         carry = step(carry, entry)
         return carry, keep(carry)
 
     # Checkpoints on both levels: memory for the states of the blocks plus those of one block.
     @rematerialise
-    def block(carry: Carry, entries: PyTree) -> tuple[Carry, PyTree]:
+    def block(carry: MethodCarry, entries: PyTree) -> tuple[MethodCarry, PyTree]:
         return jax.lax.scan(rematerialise(attempt, keeps_decisions=True), carry, entries)
 
     blocks = len(accepted(log))
@@ -214,12 +215,12 @@ def replay_log(
 
 
 def _scan_active(
-    work: Callable[[Carry, PyTree], tuple[Carry, PyTree]],
-    on: Callable[[Carry, PyTree], Bool],
-    carry: Carry,
-    xs: PyTree,
+    work: Callable[[MethodCarry, PyTree], tuple[MethodCarry, PyTree]],
+    on: Callable[[MethodCarry, PyTree], Bool],
+    carry: MethodCarry,
+    xs: object,
     length: int,
-) -> tuple[Carry, PyTree]:
+) -> tuple[MethodCarry, PyTree]:
     """Return the result of a scan of `work` over blocks. Where no run of the batch is `on`, a block is skipped: zeros.
 
     Most of the capacity is not needed. To skip a block costs almost as much as a short step. So whole groups of
@@ -227,15 +228,15 @@ def _scan_active(
     """
 
     def skip_unless_on(work: Callable) -> Callable:
-        def body(carry: Carry, x: PyTree) -> tuple[Carry, PyTree]:
-            def skip() -> tuple[Carry, PyTree]:
+        def body(carry: MethodCarry, x: object) -> tuple[MethodCarry, PyTree]:
+            def skip() -> tuple[MethodCarry, PyTree]:
                 return carry, jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(work, carry, x)[1])
 
             return jax.lax.cond(any_lane(on(carry, x)), lambda: work(carry, x), skip)
 
         return body
 
-    def group(carry: Carry, xs: PyTree) -> tuple[Carry, PyTree]:
+    def group(carry: MethodCarry, xs: object) -> tuple[MethodCarry, PyTree]:
         return jax.lax.scan(skip_unless_on(work), carry, xs, length=BLOCKS_PER_GROUP)
 
     groups = length // BLOCKS_PER_GROUP

@@ -16,9 +16,9 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.tracing import split_batched
-from diffabs.core.types import Array, Params, PyTree, Scalar
+from diffabs.core.types import Array, Bool, Params, PyTree, Scalar, Vector
 from diffabs.simulate.arguments import forbid_derivatives, prepare_arguments
-from diffabs.simulate.drive.loops import STEPS_PER_BLOCK, Carry
+from diffabs.simulate.drive.loops import STEPS_PER_BLOCK, MethodCarry
 from diffabs.simulate.result import finish_run, prepare
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.types import Run, Solver
@@ -35,7 +35,7 @@ class EarlyEnd(Protocol):
         """Return the data for run `number` that the condition needs, a pytree."""
         ...
 
-    def has_reached(self, data: PyTree, output: PyTree) -> Scalar:
+    def has_reached(self, data: object, output: object) -> Bool:
         """Return True if the run ends, given its `data` and the present `output` of its plant."""
         ...
 
@@ -43,10 +43,10 @@ class EarlyEnd(Protocol):
 def run_packed(
     loop: Loop,
     values: Params,
-    keys: PyTree,
+    keys: object,
     solver: Solver,
     objectives: Mapping[str, Objective],
-    accepted: Scalar,
+    accepted: Vector,
     enough: EarlyEnd | None = None,
     numbers: Array | None = None,
 ) -> Run:
@@ -72,7 +72,7 @@ def split_by_lane(
     """
     leaves, whole = split_batched(lambda v: prepare(replace(loop, v)), values)
 
-    def build_lane(lane_leaves: PyTree) -> tuple[Loop, dict[str, Objective]]:
+    def build_lane(lane_leaves: object) -> tuple[Loop, dict[str, Objective]]:
         lane_loop, audit = whole(lane_leaves)
         return lane_loop, objectives | audit
 
@@ -93,7 +93,7 @@ class _LaneSlots(NamedTuple):
 
     leaves: PyTree
     keys: PyTree
-    carry: Carry
+    carry: MethodCarry
     number: Scalar
     next: Any
     ended: Run
@@ -106,7 +106,7 @@ def _run(
     objectives: dict[str, Objective],
     method: PyTree,
     keys: PyTree,
-    accepted: Scalar,
+    accepted: Vector,
     enough: EarlyEnd | None,
     numbers: Array,
     *,
@@ -120,7 +120,7 @@ def _run(
     start = jax.vmap(lambda lane_leaves, key: method.start(*build_lane(lane_leaves), key))
     finish = jax.vmap(lambda lane_leaves, carry: finish_run(*build_lane(lane_leaves), carry)[0])
 
-    def take_lanes(number: Scalar) -> tuple[PyTree, PyTree, Carry]:
+    def take_lanes(number: Scalar) -> tuple[PyTree, PyTree, MethodCarry]:
         """Return leaves, keys and carries of these runs at t = 0; beyond the last run a copy that does not step."""
         lane_leaves, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
         carry = start(lane_leaves, key)
@@ -128,10 +128,10 @@ def _run(
         return lane_leaves, key, carry._replace(status=status.astype(carry.status.dtype))
 
     def step_and_exchange(slots: _LaneSlots) -> _LaneSlots:
-        def step_once(carry: Carry, _: object) -> tuple[Carry, None]:
+        def step_once(carry: MethodCarry, _: object) -> tuple[MethodCarry, None]:
             return step_all(slots.leaves, slots.keys, carry), None
 
-        def renew_and_step(carry: PyTree, _: object) -> tuple[PyTree, None]:
+        def renew_and_step(carry: object, _: object) -> tuple[PyTree, None]:
             return jax.lax.scan(step_once, renew_all(slots.leaves, carry), length=STEPS_PER_BLOCK)[0], None
 
         slots = slots._replace(
@@ -164,7 +164,7 @@ def _lanes_ended_early(
 def _exchange_lanes(
     slots: _LaneSlots,
     free: PyTree,
-    finish: Callable[[PyTree, Carry], Run],
+    finish: Callable[[PyTree, MethodCarry], Run],
     take_lanes: Callable[[PyTree], PyTree],
     count: int,
 ) -> _LaneSlots:
@@ -179,7 +179,7 @@ def _exchange_lanes(
     return _LaneSlots(lane_leaves, key, carry, jnp.minimum(number, count), slots.next + jnp.sum(free), ended)
 
 
-def _select_lanes(free: Scalar, a: Scalar, b: Scalar) -> PyTree:
+def _select_lanes(free: Array, a: Array, b: Scalar) -> PyTree:
     if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(_select_lanes(free, jax.random.key_data(a), jax.random.key_data(b)))
     return jnp.where(free.reshape(-1, *[1] * (a.ndim - 1)), a, b)

@@ -29,7 +29,7 @@ TRACED_EXPLICIT_AXES = (
 )
 
 
-def describe_placement(data: PyTree) -> str:
+def describe_placement(data: object) -> str:
     """Return the reason why only XLA can run these arrays where they lie, or "" if a kernel can, too.
 
     A kernel is made for the kind of device that JAX uses by default, and for one device.
@@ -44,7 +44,7 @@ def describe_placement(data: PyTree) -> str:
     return ""
 
 
-def run_on_all_cores(run: Callable[[PyTree, Array], PyTree], columns: PyTree, count: int) -> PyTree:
+def run_on_all_cores(run: Callable[[PyTree, Array], PyTree], columns: object, count: int) -> PyTree:
     """Return run(columns, numbers of the runs), computed on all cores of this processor, one thread each.
 
     All shares have one shape, so one program, and at least `MIN_RUNS_PER_CORE` runs: a small batch uses fewer cores.
@@ -80,7 +80,7 @@ def run_on_auto_mesh(run: Callable[..., PyTree], arguments: tuple[PyTree, ...]) 
     if not meshes:
         return run(*arguments)
 
-    def back(x: Scalar) -> Any:
+    def back(x: Array) -> Any:
         mesh = getattr(getattr(x, "sharding", None), "mesh", None)
         return _put_on_mesh(x, meshes[mesh]) if mesh in meshes else x
 

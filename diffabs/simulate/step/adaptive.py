@@ -30,7 +30,7 @@ from diffabs.core.cubic import HermiteStep
 from diffabs.core.lanes import any_lane, select
 from diffabs.core.log import borrow
 from diffabs.core.loop import Loop, LoopState
-from diffabs.core.types import Bool, Int, Key, PyTree, Scalar
+from diffabs.core.types import Any, AnyArray, Array, Bool, Int, Key, PyTree, Scalar
 from diffabs.simulate.result import observe
 from diffabs.simulate.step.advance import (
     Carry,
@@ -161,8 +161,8 @@ class AdaptiveReport(NamedTuple):
     error: Scalar
     scale: PyTree
     past_crossing: Scalar
-    grazes: Bool
-    returns: Int
+    grazes: Any
+    returns: Array
     surface: SurfaceCrossing | None
 
 
@@ -187,9 +187,9 @@ class AdaptiveStepping:
         stable: True if stability limits a step, too. The error of a run at rest shows no derivative that grows.
     """
 
-    h: Scalar
+    h: Array
     steps: Int
-    rtol: Scalar
+    rtol: AnyArray
     keeps_last_step: bool = False
     keeps_mode: bool = False
     watches: bool = False
@@ -408,7 +408,7 @@ class AdaptiveStepping:
         status = jnp.where(report.grazes, RunStatus.GRAZED, status)
         return jnp.where(slides, RunStatus.SLID, status)
 
-    def _find_stability_limit(self, loop: Loop, t: Scalar, state: LoopState, scale: Scalar) -> Scalar:
+    def _find_stability_limit(self, loop: Loop, t: Array, state: LoopState, scale: Array) -> Scalar:
         """Return the longest stable step [s]; the whole span if the Jacobian of the `loop` is not finite."""
         limit = spectral_step_limit(loop, t, state, scale)
         return jnp.where(limit > 0, limit, self.h * self.steps)  # False also for NaN
@@ -470,13 +470,13 @@ class AdaptiveStepping:
         return jnp.maximum(new, shortest_step(attempt.point.t))
 
 
-def clip_rtol(rtol: Scalar) -> Scalar:
+def clip_rtol(rtol: AnyArray) -> AnyArray:
     """Return rtol, but at least the multiple `MIN_RTOL_EPS` of the machine epsilon of its type."""
     numpy_like = np if isinstance(rtol, np.ndarray) else jnp  # NumPy compiles nothing
     return numpy_like.maximum(rtol, MIN_RTOL_EPS * jnp.finfo(rtol.dtype).eps)
 
 
-def _pack_events(triggered: PyTree) -> Int:
+def _pack_events(triggered: object) -> Int:
     """Return the triggered events as a bit mask, one bit for each event."""
     return sum((jnp.where(happens, 1 << i, 0) for i, happens in enumerate(jax.tree.leaves(triggered))), jnp.asarray(0))
 

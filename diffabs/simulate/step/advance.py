@@ -72,12 +72,12 @@ class Carry(NamedTuple):
     since: Scalar
     length: Scalar
     strikes: Bool
-    base: Scalar
+    base: Array
     search: EventSearch
     unrestricted: Bool
     slides: PyTree
     control: PyTree
-    status: Scalar
+    status: Array
 
     running = property(is_running)
 
@@ -108,7 +108,7 @@ class Stepping(Protocol):
     """A stepping method: what `advance` needs of it."""
 
     @property
-    def h(self) -> Scalar:
+    def h(self) -> Array:
         """Step of the grid [s]."""
         ...
 
@@ -161,7 +161,7 @@ class Stepping(Protocol):
         ...
 
     def report(
-        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: PyTree
+        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: object
     ) -> Any:
         """Return the findings about an attempt, by the run of `carry` in `system`, that the method needs.
 
@@ -362,7 +362,7 @@ def have_same_answers(carry: Carry, attempt: Attempt) -> Bool:
     return jnp.all(jnp.array([a == b for a, b in pairs], bool))
 
 
-def cast_floats(tree: PyTree, dtype: DTypeLike) -> PyTree:
+def cast_floats(tree: object, dtype: DTypeLike) -> PyTree:
     """Return the tree with strong types throughout, and its floating-point leaves cast to one type."""
 
     # A scan rejects a carry whose type weakens or strengthens.

@@ -20,7 +20,7 @@ from diffabs.core.log import borrow
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
-from diffabs.core.types import Bool, Int, PyTree, Scalar
+from diffabs.core.types import Any, Array, Bool, Int, PyTree, Scalar
 from diffabs.simulate.step.modes import Mode, ModeBits, single_bit
 from diffabs.simulate.step.runge_kutta import Tableau, runge_kutta_step
 from diffabs.simulate.step.surfaces import valid_end_rates
@@ -50,7 +50,7 @@ class Point(NamedTuple):
         forecast: Prediction of the stepping method from here (`Stepping.forecast`).
     """
 
-    t: Scalar
+    t: Array
     state: LoopState
     accumulators: Accumulators
     sample: Sample
@@ -118,7 +118,7 @@ def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopS
 
 
 def evaluate_point(
-    system: LoopSystem, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode, forecast: Forecast
+    system: LoopSystem, t: Array, state: LoopState, accumulators: Accumulators, mode: Mode, forecast: Forecast
 ) -> Point:
     """Return the point at an instant, from the state after the changes there."""
     return _build_point(system.evaluate(t, state, accumulators, mode), t, state, accumulators, forecast)
@@ -140,7 +140,7 @@ def attempt_step(
     loop, (t, h), mode = system.loop, (request.end, request.h), request.mode
     z, held = split_flow_and_held(point.state, point.accumulators)
 
-    def flow(t: Scalar, z: PyTree, constants: tuple[PyTree, Mode]) -> PyTree:
+    def flow(t: Scalar, z: object, constants: tuple[PyTree, Mode]) -> PyTree:
         return system.rates(t, z, *constants)
 
     z, error = runge_kutta_step(tableau, flow, point.t, z, point.rates, h, (held, mode))
@@ -218,7 +218,7 @@ def mode_in_step(system: LoopSystem, words: ModeBits, free: Bool) -> Mode:
     return Mode(words, free, tuple(jnp.where(free, all, none) for _ in range(system.word_count)))
 
 
-def mode_after_changes(system: LoopSystem, words: ModeBits, number: Scalar, lands: Bool) -> Mode:
+def mode_after_changes(system: LoopSystem, words: ModeBits, number: Array, lands: Bool) -> Mode:
     """Return the mode in which the dynamics are evaluated after the changes at the end of a step.
 
     If it `lands` on the switching surface of a comparison, that one keeps its answer in `words`, those of
@@ -228,14 +228,14 @@ def mode_after_changes(system: LoopSystem, words: ModeBits, number: Scalar, land
     return Mode(words, ~lands, tuple(~bit for bit in frozen))
 
 
-def flip_answer(system: LoopSystem, words: ModeBits, number: Scalar, lands: Bool) -> ModeBits:
+def flip_answer(system: LoopSystem, words: ModeBits, number: Array, lands: Bool) -> ModeBits:
     """Return the answers with that of one comparison reversed where a step `lands` on its switching surface."""
     bits = single_bit(number, system.word_count)
     return tuple(word ^ jnp.where(lands, bit, jnp.uint32(0)) for word, bit in zip(words, bits, strict=True))
 
 
 def _build_point(
-    dynamics: Evaluation, t: Scalar, state: LoopState, accumulators: Accumulators, forecast: Forecast
+    dynamics: Evaluation, t: Any, state: LoopState, accumulators: Accumulators, forecast: Forecast
 ) -> Point:
     signals = dynamics.signals
     return Point(

@@ -20,7 +20,7 @@ import numpy as np
 from jax._src.source_info_util import user_frame  # JAX has no public function that names the line of an operation
 from jax.extend.core import JaxprEqn
 
-from diffabs.core.types import Equation, PyTree, Scalar, Source
+from diffabs.core.types import Array, Equation, PyTree, Scalar, Source
 from diffabs.simulate.step import inner_functions
 from diffabs.simulate.step.inner_functions import (
     SEARCHSORTED,
@@ -58,7 +58,7 @@ class SwitchedProgram:
     """
 
     def __init__(
-        self, f: Callable[[PyTree, PyTree], PyTree], moving: PyTree, fixed: PyTree, counts: Callable[[PyTree], PyTree]
+        self, f: Callable[[PyTree, PyTree], PyTree], moving: object, fixed: object, counts: Callable[[PyTree], PyTree]
     ):
         """Trace `f` for arguments with the shapes of `moving` and `fixed`.
 
@@ -94,12 +94,12 @@ class SwitchedProgram:
         """Number of words that hold the answers; at least one."""
         return max(1, -(-self.bit_count // WORD_BITS))
 
-    def __call__(self, pick: Callable[[PyTree], PyTree], moving: PyTree, fixed: PyTree, mode: Mode) -> Scalar:
+    def __call__(self, pick: Callable[[PyTree], PyTree], moving: object, fixed: object, mode: Mode) -> Scalar:
         """Return the outputs that `pick` picks at (`moving`, `fixed`) in `mode`."""
         return self._run(pick, moving, fixed, mode, False)[0]
 
     def look(
-        self, pick: Callable[[PyTree], PyTree], moving: PyTree, fixed: PyTree, mode: Mode
+        self, pick: Callable[[PyTree], PyTree], moving: object, fixed: object, mode: Mode
     ) -> tuple[PyTree, ComparisonAnswers]:
         """Return the outputs that `pick` picks at (`moving`, `fixed`) in `mode`, and the answers to all comparisons."""
         return self._run(pick, moving, fixed, mode, True)
@@ -137,7 +137,7 @@ class SwitchedProgram:
             values = values.union(op.ins) if needed[-1] else values
         return needed[::-1]
 
-    def _value(self, name: Any, moves: bool) -> int:
+    def _value(self, name: object, moves: bool) -> int:
         """Return the number of a new value; equal names mark equal values."""
         self._names.append(self._numbers.setdefault(name, len(self._names)))
         self._moves.append(moves)
@@ -158,7 +158,7 @@ class SwitchedProgram:
         """Add the operations of a jaxpr, and return the numbers of its outputs; `source` wrote its call."""
         at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
-        def read(atom: PyTree) -> int:
+        def read(atom: object) -> int:
             return self._literal(atom) if isinstance(atom, jex.Literal) else at[atom]
 
         bent = find_bent(jaxpr)
@@ -224,7 +224,7 @@ class SwitchedProgram:
         return numbers[key], turned
 
 
-def _nearest_line(source: Source, caller: Any) -> Any:
+def _nearest_line(source: Source, caller: object) -> Any:
     """Return JAX's record `source` of an operation if it names a line of a user, and otherwise that of its caller."""
     frame = user_frame(source.traceback)
     return source if caller is None or (frame and frame.file_name != inner_functions.__file__) else caller
@@ -270,7 +270,7 @@ _COMPARISONS: dict[str, Callable[..., list[tuple[int, int, bool]]]] = {
 }
 
 
-def _sign(trace: ComparisonTrace, op: _Op, x: Scalar) -> list[PyTree]:
+def _sign(trace: ComparisonTrace, op: _Op, x: Array) -> list[PyTree]:
     zero = jnp.zeros_like(x)
     up, down = trace(op.queries[0], x, zero, True), trace(op.queries[1], zero, x, True)
     return [jnp.where(up, 1, jnp.where(down, -1, 0)).astype(x.dtype)]
@@ -281,7 +281,7 @@ def _clamp(trace: ComparisonTrace, op: _Op, low: Scalar, x: Scalar, high: Scalar
     return [jnp.where(trace(op.queries[0], low, x, True), low, jnp.where(trace(op.queries[1], x, high, True), high, x))]
 
 
-def _search(trace: ComparisonTrace, op: _Op, knots: Scalar, x: Scalar) -> list[PyTree]:
+def _search(trace: ComparisonTrace, op: _Op, knots: Array, x: Scalar) -> list[PyTree]:
     return [trace.search(op.queries[0], lambda: op.apply(knots, x)[0], knots, x)]
 
 

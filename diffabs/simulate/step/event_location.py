@@ -33,7 +33,7 @@ import jax.numpy as jnp
 
 from diffabs.core.lanes import keep_decision, select
 from diffabs.core.numerics import ratio
-from diffabs.core.types import AnyArray, Bool, Int, PyTree, Scalar
+from diffabs.core.types import Any, AnyArray, Array, Bool, Int, PyTree, Scalar
 from diffabs.simulate.step.modes import ComparisonAnswers, SurfaceCrossing, find_contradicted
 from diffabs.simulate.step.status import RunStatus
 from diffabs.simulate.step.system import Evaluation
@@ -71,7 +71,7 @@ class EventSearch(NamedTuple):
         fall: Slope of the margin at the end of the final step [1/s]; 0 if the event's time has no derivative.
     """
 
-    number: Int
+    number: Array
     full: Scalar
     at_full: Scalar
     near: Scalar
@@ -111,9 +111,9 @@ class AttemptCrossings(NamedTuple):
     """
 
     sought: EventCrossing
-    falls: Scalar
+    falls: Any
     unsought: EventCrossing
-    another: Bool
+    another: Array
 
 
 class SearchPlan(NamedTuple):
@@ -127,7 +127,7 @@ class SearchPlan(NamedTuple):
 
     search: EventSearch
     length: Scalar
-    status: Scalar
+    status: Array
 
 
 def init_search(h: Scalar) -> EventSearch:
@@ -141,7 +141,7 @@ def falls_through(before: list[PyTree], after: list[PyTree]) -> list[PyTree]:
     return [(a >= 0) & (b < 0) for a, b in zip(before, after, strict=True)]
 
 
-def _find_event_crossings(number: Scalar, first: int, before: list[PyTree], after: list[PyTree]) -> AttemptCrossings:
+def _find_event_crossings(number: Array, first: int, before: list[PyTree], after: list[PyTree]) -> AttemptCrossings:
     crossed = falls_through(before, after)
     unsought_falls = [crosses & (number != first + i) for i, crosses in enumerate(crossed)]
     triples = zip(unsought_falls, before, after, strict=True)
@@ -152,14 +152,14 @@ def _find_event_crossings(number: Scalar, first: int, before: list[PyTree], afte
     return AttemptCrossings(picked[0], falls, picked[1], jnp.any(jnp.stack(unsought_falls)))
 
 
-def find_surface_crossing(dynamics: Evaluation, number: Scalar, like: Scalar) -> SurfaceCrossing:
+def find_surface_crossing(dynamics: Evaluation, number: Array, like: Scalar) -> SurfaceCrossing:
     """Return the comparisons whose answers at the end of a step contradict its mode; `like` has the margin's type."""
     margins = [(surface.numbers, surface.value) for surface in dynamics.surfaces]
     return find_contradicted(ComparisonAnswers(dynamics.words, dynamics.contradicted, margins), number, like)
 
 
 def find_crossings(
-    number: Scalar, bit_count: int, surface: SurfaceCrossing | None, before: list[PyTree], after: list[PyTree]
+    number: Array, bit_count: int, surface: SurfaceCrossing | None, before: list[PyTree], after: list[PyTree]
 ) -> AttemptCrossings:
     """Return the crossings of switching surfaces and events within an attempt.
 
@@ -176,7 +176,7 @@ def find_crossings(
 
 
 def continue_search(
-    plan: SearchPlan, crossings: AttemptCrossings, base: Scalar, bit_count: int, *, refines: bool
+    plan: SearchPlan, crossings: AttemptCrossings, base: Array, bit_count: int, *, refines: bool
 ) -> SearchPlan:
     """Return the search after an attempt that contains an event or a switching surface.
 
@@ -199,7 +199,7 @@ def continue_search(
 
 
 def _bracket_event(
-    search: EventSearch, x: Scalar, new: PyTree, crossings: AttemptCrossings, h: Scalar
+    search: EventSearch, x: Scalar, new: PyTree, crossings: AttemptCrossings, h: Array
 ) -> tuple[EventSearch, PyTree, PyTree]:
     """Return three values after an attempt: the search for the earliest event, the next length [s], and a flag.
 
@@ -317,13 +317,13 @@ def _length_tangent(search: EventSearch, x: Scalar, g: AnyArray, zero: Scalar, f
     return -rises / jnp.where(has_tangent, fall, -1.0)
 
 
-def _shows_curvature(end: tuple[PyTree, PyTree], place: Scalar, probe: Scalar) -> Scalar:
+def _shows_curvature(end: tuple[PyTree, PyTree], place: Scalar, probe: Scalar) -> Bool:
     """Return True if the margin at an end of an attempt determines the curvature between the place and the probe."""
     length, margin = end
     return (jnp.abs(length - place) > 4 * jnp.abs(place - probe)) & jnp.isfinite(margin)
 
 
-def _falls_from_start(search: EventSearch, fall: Scalar, start: PyTree) -> Scalar:
+def _falls_from_start(search: EventSearch, fall: Scalar, start: PyTree) -> Bool:
     """Return True if the margin is smooth and falls at the beginning of the step at `GRAZING_FRACTION` of its mean rate
     or faster.
 

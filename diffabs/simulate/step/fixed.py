@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.loop import Loop, LoopState
-from diffabs.core.types import Bool, Int, Key, PyTree, Scalar
+from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
 from diffabs.simulate.result import observe
 from diffabs.simulate.step.advance import (
     Carry,
@@ -88,7 +88,7 @@ class FixedStepping:
         smooth: True if nothing switches and no event can happen. Then each attempt is a step to the next instant.
     """
 
-    h: Scalar
+    h: Array
     steps: Int
     kinks: bool | None = None
     second_order: bool = False
@@ -163,7 +163,7 @@ class FixedStepping:
         return look_ahead(carry.status == RunStatus.REFRESHING, dynamics) if self.watches else ()
 
     def report(
-        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: PyTree
+        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: object
     ) -> FixedStepReport:
         """Return the comparisons that an attempt contradicts at its end, and whether a margin grazes zero."""
         del state, error

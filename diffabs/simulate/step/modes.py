@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.types import Bool, Int, PyTree, Scalar
+from diffabs.core.types import Array, Bool, PyTree, Scalar, Vector
 
 WORD_BITS = 32  # answers in a word
 NO_BIT = -2  # number of no comparison; -1 is the number of a comparison that was not found
@@ -47,7 +47,7 @@ class ComparisonAnswers(NamedTuple):
     margins: list[tuple[PyTree, PyTree]]
 
 
-def single_bit(number: Scalar, words: int) -> ModeBits:
+def single_bit(number: Array, words: int) -> ModeBits:
     """Return packed words with one bit set, or without a set bit if its `number` is negative."""
     word, place = number // WORD_BITS, (number % WORD_BITS).astype(jnp.uint32)
     return tuple(jnp.where(word == i, jnp.uint32(1) << place, jnp.uint32(0)) for i in range(words))
@@ -63,13 +63,13 @@ class SurfaceCrossing(NamedTuple):
         margin: Margin of that comparison.
     """
 
-    unsought: Int
+    unsought: Array
     contradicted: Bool
-    target: Int
+    target: Array
     margin: Scalar
 
 
-def find_contradicted(answers: ComparisonAnswers, number: Scalar, like: PyTree) -> SurfaceCrossing:
+def find_contradicted(answers: ComparisonAnswers, number: Array, like: PyTree) -> SurfaceCrossing:
     """Return the contradicted comparisons, by the number of the sought one; `like` has the type of the margin."""
     unsought, crossed = jnp.asarray(-1, number.dtype), jnp.asarray(False)
     for i, (word, bit) in enumerate(
@@ -140,7 +140,7 @@ class ComparisonTrace:
         self._add(first, shape, margin)
         return answer
 
-    def search(self, ask: tuple[int, bool], says: Callable[[], PyTree], knots: Scalar, x: Scalar) -> Scalar:
+    def search(self, ask: tuple[int, bool], says: Callable[[], PyTree], knots: Vector, x: Scalar) -> Array:
         """Return the number of knots that are not above `x`, as an integer; each knot has one bit.
 
         `ask` holds the number of the search and is otherwise not used. `says()` is the search by the numbers. The
@@ -171,7 +171,7 @@ class ComparisonTrace:
     def _add(self, first: int, shape: tuple[int, ...], margin: Scalar) -> None:
         self.margins.append((first + np.arange(np.prod(shape)).reshape(shape) if shape else first, margin))
 
-    def _between(self, first: int, below: Scalar, knots: Scalar, x: Scalar) -> tuple[PyTree, PyTree]:
+    def _between(self, first: int, below: Scalar, knots: Vector, x: Scalar) -> tuple[PyTree, PyTree]:
         """Return the distances of x from the knots below and above it, and record them as margins.
 
         `below` is the number of knots that count as not above x, and `first` the bit of the first knot.
@@ -207,7 +207,7 @@ class ComparisonTrace:
         )
 
 
-def _ones(count: Scalar) -> Scalar:
+def _ones(count: Array) -> Array:
     """Return a word with the lowest `count` bits set."""
     return (jnp.uint32(1) << count.astype(jnp.uint32)) - 1
 

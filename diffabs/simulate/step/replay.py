@@ -60,9 +60,9 @@ class StepLog(NamedTuple):
     """
 
     accepted: Bool
-    t: Scalar
+    t: Array
     length: Scalar
-    base: Scalar
+    base: Array
     k: Int
     triggered: Int
     words: ModeBits
@@ -100,7 +100,7 @@ class ReplayStepping:
     tableau, has_margin_rates, searches, smooth, second_order = TSIT5, True, False, False, False
 
     @property
-    def h(self) -> Scalar:
+    def h(self) -> Array:
         """Step of the grid [s]."""
         return self.live.h
 
@@ -160,7 +160,7 @@ class ReplayStepping:
         return ()
 
     def report(
-        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: PyTree
+        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: object
     ) -> PyTree:
         """Return nothing: the log has the decisions."""
         del system, carry, h, dynamics, state, error
@@ -312,5 +312,5 @@ def _time_to_zero(on: Bool, margin: Scalar, fall: Scalar, longest: Scalar) -> tu
     return close, -margin / jax.lax.stop_gradient(jnp.where(close, fall, 1.0))
 
 
-def _stop_gradients(tree: PyTree) -> PyTree:
+def _stop_gradients(tree: object) -> PyTree:
     return jax.tree.map(jax.lax.stop_gradient, tree)

@@ -81,7 +81,7 @@ def runge_kutta_step(
     x: X,
     rate: X,
     h: Scalar,
-    arguments: PyTree = (),
+    arguments: object = (),
 ) -> tuple[X, X]:
     """Return x(t + h) after one step of dx/dt = derivative(t, x, arguments), and the rates' shares in its error.
 
@@ -105,7 +105,7 @@ def _step(tableau: Tableau, f: Callable, t: Scalar, x: X, rate: X, h: Scalar, co
     return _unrolled_step(tableau, lambda t, x: f(t, x, *constants), t, x, rate, h)
 
 
-def _rule(tableau: Tableau, f: Callable, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
+def _rule(tableau: Tableau, f: Callable, primals: object, tangents: object) -> tuple[PyTree, PyTree]:
     return jvp_nonzero(lambda *step: _scanned_step(tableau, f, *step), primals, tangents)
 
 

@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from diffabs.core.loop import Loop, LoopState
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Sample
-from diffabs.core.types import Int, PyTree, Scalar
+from diffabs.core.types import Array, Int, PyTree, Scalar, Vector
 
 INITIAL_STEP_S = 1e-4  # s, the first step
 SAFETY, MIN_ERROR = 0.85, 1e-6  # fraction of the optimal length; offset that keeps the length finite for an error of 0
@@ -67,14 +67,14 @@ def plan_step(length: Scalar, ahead: Scalar, to_strike: Scalar) -> tuple[PyTree,
     return jnp.where(ends, to_strike, jnp.where(2 * length > to_strike, 0.5 * to_strike, length)), ends
 
 
-def shortest_step(t: Scalar) -> Scalar:
+def shortest_step(t: Array) -> Scalar:
     """Return the shortest step [s] that changes the time `t` [s] by more than its rounding."""
     number = jnp.finfo(t.dtype)
     # At t = 0 numbers are far closer than steps need to be. This one keeps quotients by a step finite.
     return jnp.maximum(MIN_STEP_EPS * number.eps * jnp.abs(t), number.tiny / number.eps)
 
 
-def spectral_step_limit(loop: Loop, t: Scalar, state: LoopState, scale: Scalar) -> Scalar:
+def spectral_step_limit(loop: Loop, t: Array, state: LoopState, scale: Vector) -> Scalar:
     """Return the stability limit of a step, 3/rho [s], with an estimate rho of the spectral radius of the flow's
     Jacobian.
 

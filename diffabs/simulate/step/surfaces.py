@@ -30,7 +30,7 @@ class SwitchingFunction(NamedTuple):
 
     numbers: PyTree
     value: Scalar
-    rate: Scalar = None
+    rate: Scalar | None = None
 
 
 def forecast_crossing(surfaces: Sequence[SwitchingFunction], natural: Scalar, shortest: Scalar) -> Scalar:
@@ -82,12 +82,12 @@ def find_imminent(surfaces: Sequence[SwitchingFunction], natural: Scalar) -> Imm
     return Imminent(number, time)
 
 
-def find_return(imminent: Imminent, surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> Int:
+def find_return(imminent: Imminent, surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> Array:
     """Return the number of a comparison that a step crosses and that moves back in it or at its end; -1 without one."""
     back = (imminent.time < STEP_START_FRACTION * length) & ~read_bits(changed, imminent.number)
     number = jnp.where(back, imminent.number, -1)
     for surface in surfaces:
-        back = read_bits(changed, surface.numbers) & (surface.value * surface.rate < 0)
+        back = read_bits(changed, surface.numbers) & (surface.value * surface.rate < 0)  # pyright: ignore[reportOptionalOperand, reportOperatorIssue]
         number = jnp.maximum(number, jnp.max(jnp.where(back, jnp.asarray(surface.numbers), -1)))
     return number
 
@@ -97,7 +97,7 @@ def _times_since_crossing(surface: SwitchingFunction) -> Array:
 
     A rate of 0 gives an infinite time or NaN, which cuts no step.
     """
-    return jnp.ravel(jnp.asarray(surface.value / surface.rate))
+    return jnp.ravel(jnp.asarray(surface.value / surface.rate))  # pyright: ignore[reportOptionalOperand, reportOperatorIssue]
 
 
 def valid_end_rates(surfaces: Sequence[SwitchingFunction], changed: ModeBits, length: Scalar) -> tuple[PyTree, PyTree]:
@@ -131,7 +131,7 @@ def is_surface_moving(surfaces: Sequence[SwitchingFunction], changed: ModeBits) 
     return jnp.any(jnp.array(moving, bool))
 
 
-def read_bits(words: ModeBits, numbers: PyTree) -> Scalar:
+def read_bits(words: ModeBits, numbers: object) -> Bool:
     """Return the bits with these numbers, bool."""
     numbers = jnp.asarray(numbers)
     word = sum(jnp.where(numbers // WORD_BITS == i, bits, jnp.uint32(0)) for i, bits in enumerate(words))

@@ -123,7 +123,7 @@ class LoopSystem(NamedTuple):
                 return _evaluate_loop((t, *z), fixed), ComparisonAnswers((), (), [])
             return self.program.look(lambda dynamics: dynamics, (t, *z), fixed, mode)
 
-        def moving_signals(t: Scalar, z: PyTree) -> tuple[PyTree, ComparisonAnswers]:
+        def moving_signals(t: Scalar, z: object) -> tuple[PyTree, ComparisonAnswers]:
             dynamics, answers = look(t, z)
             sample = dynamics.signals.sample
             shown = {"sample": sample, "shown": Shown.of(sample), "": ()}[self.signal_rates]
@@ -189,7 +189,7 @@ def _find_asked_rates(
     """Return the signals of a segment whose rates the objectives ask for, as `LoopSystem.signal_rates`."""
     needed = set()
 
-    def note(kind: str, rates: PyTree) -> tuple[PyTree, PyTree]:
+    def note(kind: str, rates: object) -> tuple[PyTree, PyTree]:
         needed.add(kind)
         return rates, rates
 
@@ -235,6 +235,6 @@ def _evaluate_loop(moving: PyTree, fixed: PyTree) -> LoopEvaluation:
 
 
 @jax.jit  # traced and differentiated once for all stages of a step
-def _evaluate_rates(moving: PyTree, fixed: PyTree) -> PyTree:
+def _evaluate_rates(moving: object, fixed: object) -> PyTree:
     """Return the rates of `_evaluate_loop`."""
     return _evaluate_loop(moving, fixed)[:2]

@@ -42,12 +42,10 @@ Rockafellar and S. Uryasev, Optimization of conditional value-at-risk, J. Risk 2
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
-
-from diffabs.core.types import PyTree
 
 BOOTSTRAP_REPLICATES = 999
 # Rounding: differences are multiples of 2^-ROUNDING_BITS of their largest, and not larger than this, relative to the
@@ -82,7 +80,7 @@ class IntervalEstimate(NamedTuple):
         return self._asdict()
 
 
-def as_column(values: PyTree, minimum: int = 1) -> np.ndarray:
+def as_column(values: object, minimum: int = 1) -> np.ndarray:
     """Return finite values as float64, shape (n,); raise ValueError for another shape, or too few values."""
     x = np.asarray(values, dtype=np.float64)
     if x.ndim != 1:
@@ -144,7 +142,7 @@ class Moments:
     third: float
 
     @classmethod
-    def of(cls, values: PyTree) -> "Moments":
+    def of(cls, values: object) -> "Moments":
         """Return the moments of `values` (n,), in two passes."""
         x = as_column(values, minimum=0)
         if not x.size:
@@ -205,7 +203,7 @@ class Tail:
     indices: np.ndarray
 
     @classmethod
-    def of(cls, values: PyTree, indices: Any, k: int) -> "Tail":
+    def of(cls, values: object, indices: object, k: int) -> "Tail":
         """Return the k largest of `values` (n,), with `indices` (n,) of the samples."""
         x, index = as_column(values, minimum=0), np.asarray(indices)
         if x.shape != index.shape or k < 1:
@@ -217,7 +215,7 @@ class Tail:
         return cls(k, x[order], index[order])
 
 
-def quantile(values: PyTree, level: float, *, confidence: float = 0.95) -> IntervalEstimate:
+def quantile(values: object, level: float, *, confidence: float = 0.95) -> IntervalEstimate:
     """Return a quantile by linear interpolation (`numpy.quantile`), with an interval between two order statistics.
 
     The interval covers the quantile of any law at least with this confidence. For a continuous law the probability is
@@ -248,7 +246,7 @@ def quantile_between(ordered: np.ndarray, level: float, low: int, high: int, con
 
 
 def cvar(
-    values: PyTree, level: float, *, confidence: float = 0.95, replicates: int = BOOTSTRAP_REPLICATES, seed: int = 0
+    values: object, level: float, *, confidence: float = 0.95, replicates: int = BOOTSTRAP_REPLICATES, seed: int = 0
 ) -> IntervalEstimate:
     """Return the mean of the largest fraction 1 - level of the samples; the sample at the edge counts in part.
 
@@ -282,7 +280,7 @@ def cvar(
 
 
 def summarise_column(
-    values: PyTree, confidence: float = 0.95, levels: Sequence[float] = (0.05, 0.5, 0.95), tail: float = 0.95
+    values: object, confidence: float = 0.95, levels: Sequence[float] = (0.05, 0.5, 0.95), tail: float = 0.95
 ) -> dict[str, IntervalEstimate]:
     """Return each estimate by its name: `mean`, `deviation`, `quantile 0.05` and so on, and `cvar 0.95`."""
     ordered = np.sort(as_column(values, minimum=4))

@@ -35,7 +35,6 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import stats
 
-from diffabs.core.types import PyTree
 from diffabs.sweep.statistics.estimates import (
     MIN_TAIL_SAMPLES,
     Count,
@@ -63,13 +62,13 @@ class Replicates:
     count: int
     confidence: float = 0.95
 
-    def mean(self, values: PyTree) -> IntervalEstimate:
+    def mean(self, values: object) -> IntervalEstimate:
         """Return the mean of `values` (n,) with a t interval."""
         x = as_column(values)
         centre, half = float(x.mean()), self._half_width(x)
         return IntervalEstimate(centre, centre - half, centre + half, self.confidence, len(x))
 
-    def probability(self, failed: PyTree) -> IntervalEstimate:
+    def probability(self, failed: object) -> IntervalEstimate:
         """Return the share of `failed` samples, a mask of shape (n,).
 
         The interval is that of Clopper and Pearson in three cases: fewer than 10 failures or successes, equal shares in
@@ -84,7 +83,7 @@ class Replicates:
         share, half = failures / n, half + 1 / n
         return IntervalEstimate(share, max(share - half, 0.0), min(share + half, 1.0), self.confidence, n)
 
-    def quantile(self, values: PyTree, level: float) -> IntervalEstimate:
+    def quantile(self, values: object, level: float) -> IntervalEstimate:
         """Return a quantile of `values` (n,) by linear interpolation, with an interval between two order statistics.
 
         An end is infinite where no order statistic reaches the confidence. The value is clipped to the interval.
@@ -99,7 +98,7 @@ class Replicates:
         low, high = max(n * (level - below), 0.0), min(n * (level + above), float(n))
         return quantile_between(ordered, level, math.floor(low), math.ceil(high) + 1, self.confidence)
 
-    def cvar(self, values: PyTree, level: float) -> IntervalEstimate:
+    def cvar(self, values: object, level: float) -> IntervalEstimate:
         """Return the mean of the largest fraction 1 - level of the samples; the sample at the edge counts in part.
 
         Ends are infinite with fewer than 10 samples in the tail.
@@ -112,7 +111,7 @@ class Replicates:
         estimate = self.mean(edge + np.maximum(x - edge, 0.0) / (1 - level))
         return estimate if share >= MIN_TAIL_SAMPLES else estimate._replace(low=-math.inf, high=math.inf)
 
-    def summarise_column(self, values: PyTree, levels: Sequence[float], tail: float) -> dict[str, IntervalEstimate]:
+    def summarise_column(self, values: object, levels: Sequence[float], tail: float) -> dict[str, IntervalEstimate]:
         """Return each estimate by its name: `mean`, `quantile 0.05` and so on, and `cvar 0.95`."""
         estimates = {"mean": self.mean(values)}
         estimates |= {f"quantile {level:g}": self.quantile(values, level) for level in levels}
