@@ -7,7 +7,7 @@ from scipy.stats import t
 
 
 def interval(x: np.ndarray, confidence: float) -> tuple[float, float]:
-    """Mean, and half of its t interval; NaN for fewer than two."""
+    """Return the mean and half of its t interval; NaN for fewer than two values."""
     if len(x) < 2:
         return math.nan, math.nan
     half = t.ppf((1 + confidence) / 2, len(x) - 1) * np.std(x, ddof=1) / math.sqrt(len(x))
@@ -15,5 +15,5 @@ def interval(x: np.ndarray, confidence: float) -> tuple[float, float]:
 
 
 def kept(x: np.ndarray, lanes: np.ndarray) -> np.ndarray:
-    """The values of these lanes; one NaN where there is none."""
+    """Return the values of these lanes; one NaN if there are none."""
     return x[lanes] if lanes.any() else np.full(1, np.nan)

@@ -20,8 +20,11 @@ def farthest(bounds: Bounds, slopes: np.ndarray) -> np.ndarray:
 
 
 def _road(bounds: Bounds, slopes: np.ndarray) -> np.ndarray:
-    """The best road goes from corner to corner of |z_i| <= 1 and |z_(i+1) - z_i| <= steepest: all its values are whole
-    multiples of the steepest from either bound. Found backwards, by dynamic programming."""
+    """Return the best roads, backwards by dynamic programming.
+
+    The best road goes from corner to corner of |z_i| <= 1 and |z_(i+1) - z_i| <= steepest. So each of its values is a
+    bound plus or minus a whole multiple of the steepest.
+    """
     steepest = bounds.slope * bounds.spacing / bounds.height
     rungs = steepest * np.arange(int(2 / steepest + 1e-9) + 1) - 1
     levels = np.unique(np.round(np.concatenate([rungs, -rungs]), 12))
@@ -40,8 +43,8 @@ def _road(bounds: Bounds, slopes: np.ndarray) -> np.ndarray:
 
 
 def _noise(bounds: Bounds, slopes: np.ndarray) -> np.ndarray:
-    """The best noise is clip(factor (g - level), +-peak), its level that of mean 0, its factor that of the root mean
-    square 1; both by halving."""
+    """Return the best noise, clip(factor (g - level), +-peak). Halving finds the level for mean 0 and the factor
+    for root mean square 1."""
     g = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), np.finfo(float).tiny)
 
     def noise(factor: np.ndarray) -> np.ndarray:
@@ -72,8 +75,8 @@ def along(bounds: Bounds, slopes: np.ndarray) -> np.ndarray:
 def tries(
     bounds: Bounds, z: np.ndarray, slopes: np.ndarray, steps: np.ndarray, shares: tuple[float, ...]
 ) -> np.ndarray:
-    """Return what is run after a gradient (n, tries, size): steps (n, k) along it, and shares of the way to the
-    farthest point."""
+    """Return the points that follow a gradient (n, tries, size): steps (n, k) along it, and shares of the way to
+    the farthest point."""
     far, here = farthest(bounds, slopes), z[:, None]
     moved = here + steps[:, :, None] * along(bounds, slopes)[:, None]
     towards = here + np.array(shares)[:, None] * (far - z)[:, None]

@@ -49,8 +49,10 @@ class Bounds:
 
 
 def feasible(bounds: Bounds, z: np.ndarray) -> np.ndarray:
-    """Return points of the set (n, size) for any; what is in the set stays where it is. The road's slope is limited
-    from its beginning and from its end, and the mean of both taken."""
+    """Return points of the set (n, size) for any numbers; points of the set stay unchanged.
+
+    The road is the mean of two roads: the slope is limited from the beginning, and from the end.
+    """
     road, noise, start = (np.array(z[:, block], float) for block in bounds.blocks)
     road = np.clip(road, -1.0, 1.0)
     steepest = bounds.slope * bounds.spacing / bounds.height
@@ -84,7 +86,8 @@ def parameters(bounds: Bounds, z: Any) -> dict[str, Any]:
 
 
 def nominal(bounds: Bounds) -> np.ndarray:
-    """No noise, the road as it is, 5.75 kg from 50 km/h (1, size): what an excess is counted from."""
+    """Return the nominal point (1, size): an even road, no noise, 5.75 kg from 50 km/h. The excess counts from
+    there."""
     z = np.zeros((1, bounds.size))
     for i, (name, ends) in enumerate((("mass", bounds.mass), ("speed", bounds.speed))):
         z[:, bounds.blocks[2].start + i] = (2 * NOMINAL[name] - sum(ends)) / (ends[1] - ends[0])
@@ -104,8 +107,11 @@ def drawn(bounds: Bounds, count: int, random: np.random.Generator) -> np.ndarray
 
 
 def corners(bounds: Bounds, count: int, random: np.random.Generator) -> np.ndarray:
-    """Corners (count, size): first those that a person would try, roads that are high, low, or change once or
-    periodically, with noise that is a square wave; then all signs at random."""
+    """Return corners of the set (count, size).
+
+    The first ones are those that a person would try: roads that are high, low, or change once or periodically, with a
+    square wave as noise. The others have random signs.
+    """
     waves = 2 ** random.integers(1, 7, count)  # samples of a wave of noise
     phase = random.integers(0, bounds.noises, count)[:, None]
     noise = np.where((np.arange(bounds.noises) + phase) % waves[:, None] < waves[:, None] / 2, 1.0, -1.0)

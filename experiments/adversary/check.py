@@ -22,7 +22,7 @@ DENSE = 40  # points of a period at which the slip is looked at
 
 
 def by_block(attack: Attack, z: np.ndarray) -> dict[str, float]:
-    """Excess [%] at a point (1, size) where only one block of it is there, the others nominal; and of all together."""
+    """Return the excess [%] of each block of a point (1, size) alone, the others nominal, and of all together."""
     rest = nominal(attack.bounds)
     points = np.repeat(rest, 5, axis=0)
     for i, block in enumerate(attack.bounds.blocks):
@@ -34,7 +34,7 @@ def by_block(attack: Attack, z: np.ndarray) -> dict[str, float]:
 
 
 def with_shorter_steps(attack: Attack, z: np.ndarray) -> dict[str, float]:
-    """Overshoot [%] at a point (1, size), and its change where the step is halved, and halved again."""
+    """Return the overshoot [%] at a point (1, size), and its change if the step is halved, and halved again."""
     found = [float(attack.runs(z, finer).metrics["overshoot"][0]) for finer in (1, 2, 4)]
     return {"overshoot [%]": 100 * found[0], "step halved": 100 * (found[1] - found[0]), "quartered": 100 * (
         found[2] - found[0]
@@ -107,14 +107,14 @@ def _plant(one: Any, factors: np.ndarray) -> tuple[Any, Any]:
 
 
 class _Computer:
-    """What target, controller and anti-windup do once a period."""
+    """Target, controller and anti-windup of one period."""
 
     def __init__(self, one: Any):
         """From their parameters."""
         self.one, self.control, self.target, self.integral = one, one.controller.controller, 0.0, 0.0
 
     def step(self, slip: float, speed: float) -> float:
-        """The torque that is asked for, of the slip and the speed as they are seen."""
+        """Return the commanded torque for the measured slip and speed."""
         one, c = self.one, self.control
         h = float(one.reference.period)
         scaled = h * float(one.reference.reference_speed) / speed

@@ -37,8 +37,10 @@ def cost_figure(found: Mapping[str, Mapping[str, Log]], nominals: Mapping[str, f
 
 
 def road_figure(attacks: Mapping[str, Attack], worst: Mapping[str, np.ndarray], seed: int) -> Any:
-    """The road and the noise that were found for each controller beside random ones, and the slips on both: all runs of
-    a controller have the mass and the start that were found."""
+    """Draw the worst road and noise of each controller beside random ones, and the slips on both.
+
+    All runs of a controller have the mass and start of the worst point.
+    """
     figure, axes = plot.sheet(len(attacks), 3, title="The road that was found, and a random one", size=(4.4, 2.7))
     for row, (name, attack) in enumerate(attacks.items()):
         usual = drawn(attack.bounds, 1, np.random.default_rng(seed))

@@ -23,7 +23,7 @@ from experiments.real_rig.loops import loop
 
 @dataclasses.dataclass(frozen=True)
 class Tuned:
-    """A tuned controller: as `real_rig` found it where the speed is known, by CVaR."""
+    """The controller that `real_rig` tunes by CVaR for a known speed."""
 
     gain: tuple[float, float] = (-2745.747324210777, -131.502965099322)
     tracking_time: float = 0.0023010235539139743  # s
@@ -36,7 +36,7 @@ TUNED = "tuned in the box"
 
 
 def attacked(bounds: Bounds, fixed: Fixed, controller: Any, reference: Any = None) -> Loop:
-    """The loop around a controller, on a road without bumps and without noise, until the adversary has chosen."""
+    """Return the loop around a controller, on an even road and without noise until the adversary has chosen."""
     one = loop(fixed, controller, KNOWN, reference)
     road = ScaledAlong(road=one.plant.road, factors=np.ones(bounds.factors), spacing=bounds.spacing)  # pyright: ignore[reportAttributeAccessIssue]
     noise = PlayedWheelNoise(noise=np.zeros(bounds.noises), period=fixed.period)
@@ -46,7 +46,7 @@ def attacked(bounds: Bounds, fixed: Fixed, controller: Any, reference: Any = Non
 
 
 def tuned(bounds: Bounds, fixed: Fixed, at: Tuned) -> Loop:
-    """That of a tuned controller."""
+    """Return the loop of a tuned controller."""
     windup = BackCalculation(tracking_time=at.tracking_time)
     controller = ProportionalFeedback(gain=np.array(at.gain), antiwindup=windup)
     return attacked(

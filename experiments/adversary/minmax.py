@@ -51,14 +51,14 @@ class Rounds:
 
 
 def attacked(attack: Attack, config: Searching, seeds: tuple[int, ...], budget: int, price: float) -> Log:
-    """Return what a search by gradients finds from these seeds."""
+    """Return the results of a search by gradients from these seeds."""
     return gradients(attack, dataclasses.replace(config, seeds=seeds, budget=budget), price)
 
 
 def hardened(
     attack: Attack, config: Rounds, searching: Searching, price: float, told: Callable[[str], None]
 ) -> tuple[list[Loop], np.ndarray]:
-    """Return the loop before the first round and after each, and every point that was found (n, size)."""
+    """Return the loop before the first round and after each, and all worst points (n, size)."""
     bounds, loops = attack.bounds, [attack.loop]
     lanes = drawn(bounds, config.box + config.room, np.random.default_rng(config.seed))
     count = 0
@@ -102,8 +102,8 @@ def _said(loop: Loop) -> str:
 
 
 def judged(attack: Attack, config: Rounds, searching: Searching, price: float) -> dict[str, Any]:
-    """Return how a loop fares against fresh adversaries, and on random points. A run that does not stop, or diverges,
-    is counted and not averaged in."""
+    """Return how a loop fares against fresh adversaries, and on random points. A run that diverges or does not stop
+    is counted, and in no mean."""
     found = attacked(attack, searching, config.fresh, config.budget, price)
     points = drawn(attack.bounds, config.samples, np.random.default_rng(config.seed + 1))
     both = found.overshoots, attack.overshoots(points)
@@ -125,8 +125,8 @@ def judged(attack: Attack, config: Rounds, searching: Searching, price: float) -
 
 
 def in_the_box(loop: Loop, config: Rounds) -> dict[str, float]:
-    """Return overshoots of the same gains in the box of `real_rig`, everything wrong at once. A run that
-    diverges counts there, with LOST."""
+    """Return overshoots of the same gains in the box of `real_rig`, with every error at once. A run that diverges
+    counts as LOST."""
     one: Any = loop
     judged = loop_of_box(Fixed(), one.controller.controller, KNOWN, one.reference)
     points = drawn_from_box(Box(), KNOWN, config.samples, config.seed + 2)

@@ -51,7 +51,7 @@ class Config:
 
 
 def searched(attack: Attack, config: Config, told: Callable[[str], None]) -> tuple[float, dict[str, Log]]:
-    """The price of a gradient, and what each search found."""
+    """Return the price of a gradient and the log of each search."""
     price = config.searching.priced(attack)
     told(f"a gradient costs {price:.1f} runs")
     logs = {}
@@ -68,8 +68,8 @@ def worst_of(logs: dict[str, Log], name: str) -> np.ndarray:
 
 
 def excesses(config: Config, logs: dict[str, Log], at_rest: float) -> list[dict[str, Any]]:
-    """Excess [%] of each search at each cost: median over the seeds, least and greatest; and what it cost to come near
-    to the greatest that was found."""
+    """Return the excess [%] of each search at each cost (median, least and greatest of the seeds), and its cost to
+    come near the greatest excess."""
     most = max(log.overshoots.max() for log in logs.values())
     near, rows = at_rest + NEAR * (most - at_rest), []
     for name, log in logs.items():
@@ -89,7 +89,7 @@ def _whole(cost: float) -> str:
 
 
 def _curve(log: Log, at_rest: float) -> list[list[float]]:
-    """Cost, and the excess [%] of each seed, where one changed."""
+    """Return the costs at which the excess [%] of a seed changes, and the excesses."""
     rows = [[spent, *(100 * (found - at_rest)).tolist()] for spent, found in log.history]
     return [row for i, row in enumerate(rows) if not i or row[1:] != rows[i - 1][1:]]
 
@@ -101,7 +101,7 @@ def ratios(config: Config, logs: dict[str, Log], at_rest: float) -> dict[str, fl
 
 
 def checked(attack: Attack, config: Config, z: np.ndarray) -> dict[str, Any]:
-    """What was found, run otherwise; and the gradient there beside differences."""
+    """Return checks of the worst points: other steps, another program, and the gradient beside differences."""
     run = attack.runs(z)
     entries = np.array([0, 1, 2, *range(config.bounds.factors, config.bounds.factors + 6), config.bounds.size - 2])
     start = parameters(config.bounds, z)
@@ -117,7 +117,7 @@ def checked(attack: Attack, config: Config, z: np.ndarray) -> dict[str, Any]:
 
 
 def against(name: str, attack: Attack, config: Config, told: Callable[[str], None]) -> tuple[dict[str, Log], Any]:
-    """Everything about one controller."""
+    """Return everything about one controller."""
     at_rest = float(attack.overshoots(nominal(config.bounds))[0])
     price, logs = searched(attack, config, lambda line: told(f"{name}, {line}"))
     rows, z = excesses(config, logs, at_rest), worst_of(logs, GRADIENTS)
@@ -134,8 +134,11 @@ def against(name: str, attack: Attack, config: Config, told: Callable[[str], Non
 
 
 def in_more_dimensions(config: Config, told: Callable[[str], None]) -> list[dict[str, Any]]:
-    """Gradients and CMA-ES against the tuned controller, where road and noise have many more numbers: no part of what
-    was fixed beforehand. A kernel does not take so many that differ between lanes, so XLA makes the runs."""
+    """Return gradients and CMA-ES against the tuned controller with many more numbers of road and noise.
+
+    Nothing of this was fixed beforehand. A kernel does not take so many numbers that differ between lanes, so XLA makes
+    the runs.
+    """
     bounds, searching = config.finer, dataclasses.replace(config.searching, budget=config.finer_budget)
     running = dataclasses.replace(config.running, engine="xla")
     attack = Attack(contenders(bounds, config.fixed)[TUNED], bounds, running)
@@ -149,7 +152,7 @@ def in_more_dimensions(config: Config, told: Callable[[str], None]) -> list[dict
 
 
 def tuned_against(attack: Attack, config: Config, price: float, told: Callable[[str], None]) -> dict[str, Any]:
-    """The rounds, and how each loop fares against fresh adversaries."""
+    """Return the rounds, and how each loop fares against fresh adversaries."""
     loops, _ = hardened(attack, config.rounds, config.searching, price, told)
     rows = []
     for number, loop in enumerate(loops):

@@ -41,7 +41,7 @@ class Searching:
 
 @dataclasses.dataclass(eq=False)
 class Log:
-    """What searches, one for each seed, have spent and found."""
+    """The costs and overshoots of searches, one for each seed."""
 
     points: np.ndarray  # the worst so far (seeds, size)
     overshoots: np.ndarray  # there (seeds,)
@@ -58,11 +58,11 @@ class Log:
         self.history.append((self.spent, self.overshoots.copy()))
 
     def at(self, cost: float) -> np.ndarray:
-        """Return the greatest overshoots (seeds,) that this cost found; -inf before anything was counted."""
+        """Return the greatest overshoots (seeds,) up to this cost; -inf before the first count."""
         return next((found for spent, found in reversed(self.history) if spent <= cost), 0 * self.overshoots - np.inf)
 
     def cost_of(self, overshoot: float) -> np.ndarray:
-        """Return what it cost each search to find so much (seeds,); inf for one that did not."""
+        """Return the cost at which each search reached this overshoot (seeds,); inf for a search that did not."""
         costs, found = np.array([s for s, _ in self.history]), np.array([o for _, o in self.history])
         there = found >= overshoot
         return np.where(there.any(axis=0), costs[there.argmax(axis=0)], np.inf)
@@ -107,8 +107,10 @@ def _screened(attack: Attack, config: Searching, log: Log) -> np.ndarray:
 
 
 def cma_es(attack: Attack, config: Searching, price: float, starts: int | None = None) -> Log:
-    """Search by CMA-ES, which sees f(feasible(z)), from the worst of the screened points, as many at a time as
-    gradients unless told otherwise. A start that has come to its own end makes room for the next."""
+    """Search by CMA-ES on f(feasible(z)), from the worst of the screened points.
+
+    By default as many points run at a time as for gradients. A search that ends makes room for the next start.
+    """
     del price
     log, size, starts = _log(config, attack.bounds), attack.bounds.size, starts or config.starts
     queue = _screened(attack, config, log)
@@ -134,8 +136,8 @@ def cma_es(attack: Attack, config: Searching, price: float, starts: int | None =
 
 
 def gradients(attack: Attack, config: Searching, price: float) -> Log:
-    """Search by gradients from the worst of the screened points, several at a time; a start that gets no further makes
-    room for the next."""
+    """Search by gradients from the worst of the screened points, several at a time. A start that gets no further
+    makes room for the next."""
     bounds, log = attack.bounds, _log(config, attack.bounds)
     queue = _screened(attack, config, log)
     seeds, waiting, size = queue.shape

@@ -27,9 +27,14 @@ INERTIA = 1.0539  # kg m^2, of the cars of `pid_over_roads`
 
 
 class Bound(NamedTuple):
-    """Of each lane: the bound [m]; the distance at the peak's friction alone [m]; the slip of the peak on both surfaces
-    [1]; whether there is one surface only, so that the bound is attained; whether the torque is too weak for the peak
-    of the first surface."""
+    """Of each lane: the bound and two conditions under which it holds.
+
+    - distance: the bound [m].
+    - friction: the distance at the peak's friction alone [m].
+    - slips: the slip of the peak on both surfaces [1].
+    - attained: one surface only, so that a stop attains the bound.
+    - weak: the torque is too weak for the peak of the first surface.
+    """
 
     distance: np.ndarray
     friction: np.ndarray
@@ -48,7 +53,8 @@ class Way(NamedTuple):
 
 
 def bound(values: Mapping[str, Any], torque: float, width: float) -> Bound:
-    """Of lanes with these values by path, a greatest torque [N m] and a width of the edges [m]."""
+    """Return the bounds of lanes with these values by path, for a greatest torque [N m] and a width of the edges
+    [m]."""
     surfaces = [{n: np.asarray(values[f"plant.road.roads.{i}.{n}"]) for n in "BCDE"} for i in (0, 1)]
     first, second = surfaces
     peaks = [np.array([stiffness(1.0, c, e) for c, e in zip(s["C"], s["E"], strict=True)]) / s["B"] for s in surfaces]
@@ -72,7 +78,7 @@ def mu(surface: Mapping[str, Any], slip: Any) -> Any:
 
 
 def whole_torque(surface: Mapping[str, Any], peak: np.ndarray, mass: np.ndarray, v0: np.ndarray, torque: float) -> Way:
-    """From slip 0 to the peak, or to where the torque can do no more."""
+    """Return the braking from slip 0 to the peak, or to the greatest slip that the torque reaches."""
     radius = float(QuarterCar().radius)
 
     def rate(slip: Any) -> Any:

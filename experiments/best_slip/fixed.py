@@ -31,7 +31,7 @@ EXACT, ERRORS = "exact sensors", "noise and bias"
 
 @dataclasses.dataclass(frozen=True)
 class Fixed:
-    """What does not change when the search changes."""
+    """The numbers that do not change with the search."""
 
     roads: Roads = dataclasses.field(default_factory=Roads)  # its ranges, counts and seed; held out: the next seed
     torque: float = 90.0  # N m, the most that the brake has
@@ -56,14 +56,14 @@ class Lanes:
     bound: Bound
 
     def batch(self, sensors: str, **more: Any) -> Batch:
-        """The lanes as they are run; bias and noise where the sensors have errors."""
+        """Return the lanes as a batch, with bias and noise if the sensors have errors."""
         errors = sensors == ERRORS
         values = self.family.values | ({"sensor.blocks.1.bias": self.bias} if errors else {})
         return Batch(values, self.keys if errors else None, **more)
 
 
 def lanes(fixed: Fixed, count: int, seed: int) -> Lanes:
-    """So many lanes; those of another seed are other roads, biases and noises."""
+    """Return this number of lanes. Another seed gives other roads, biases and noises."""
     roads = family(fixed.roads, count, seed)
     bias = np.random.default_rng((seed, 7)).uniform(-fixed.bias, fixed.bias, count)
     keys = np.arange(count) + (1 << 20) * seed
@@ -76,7 +76,7 @@ def good(found: dict[str, Any]) -> np.ndarray:
 
 
 def line(fixed: Fixed, found: dict[str, Any], paper: dict[str, Any], shortest: np.ndarray) -> dict[str, Any]:
-    """What is said of a rule beside the paper's, in per cent of the bound (lanes,)."""
+    """Return a rule's row beside the paper's rule, in per cent of the bound (lanes,)."""
     mine, both = good(found), good(found) & good(paper)
     ratio = found["stop_distance"] / shortest
     gain = (paper["stop_distance"] - found["stop_distance"])[both] / shortest[both]
@@ -98,7 +98,8 @@ def line(fixed: Fixed, found: dict[str, Any], paper: dict[str, Any], shortest: n
 
 
 def best(fixed: Fixed, results: dict[str, dict[str, Any]], shortest: np.ndarray) -> dict[str, Any]:
-    """The best of these rules by the criterion above: its name, and the mean of each over the common lanes [%]."""
+    """Return the best of these rules by the criterion above: its name, and the mean of each over the common lanes
+    [%]."""
     count = len(shortest)
     allowed = [name for name, one in results.items() if np.sum(~good(one)) <= fixed.most_failures * count]
     if not allowed:

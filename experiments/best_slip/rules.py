@@ -30,7 +30,7 @@ RULES = (LATCH, ROBUST, SEEKING, FIXED, SCHEDULED)
 
 @dataclasses.dataclass(frozen=True)
 class Ranges:
-    """What of each rule is tuned, and within which ranges; and where the PI's gains start."""
+    """The tuned numbers of each rule with their ranges, and the start of the PI's gains."""
 
     ki: float = 5e4  # N m/s, with an anti-windup: ten times the paper's
     tracking_time: float = 0.05  # s
@@ -72,7 +72,7 @@ class Ranges:
 
 @pytree
 class PeakAtPlace:
-    """The slip of the peak of the surface that the car is on, up to an edge and beyond it: what no sensor tells."""
+    """The slip of the peak of the present surface, up to an edge and beyond it. No sensor tells it."""
 
     before: Scalar = param(default=0.1, unit="1", above=0.0, high=1.0)
     beyond: Scalar = param(default=0.1, unit="1", above=0.0, high=1.0)
@@ -93,7 +93,7 @@ class PeakAtPlace:
 
 
 def references(ranges: Ranges) -> dict[str, Any]:
-    """Where the search for each rule starts."""
+    """Return where the search for each rule starts."""
     return {
         LATCH: PeakLatch(),
         ROBUST: PeakRobust(arming=ranges.arming),
@@ -114,7 +114,7 @@ def loop(fixed: Fixed, sensors: str, reference: Any, controller: PID) -> Loop:
 
 
 def start(ranges: Ranges, fixed: Fixed, sensors: str, rule: str) -> Loop:
-    """What is tuned, before."""
+    """Return the loop before its tuning."""
     pi = PID(ki=ranges.ki, antiwindup=BackCalculation(tracking_time=ranges.tracking_time), low=0.0, high=90.0)
     return loop(fixed, sensors, references(ranges)[rule], pi)
 
@@ -128,7 +128,7 @@ def untuned(ranges: Ranges, fixed: Fixed, sensors: str) -> Iterator[tuple[str, L
 
 
 def told_the_peak(fixed: Fixed, sensors: str, controller: Any, lanes: Lanes) -> tuple[Loop, Batch]:
-    """The loop that knows every road, under the controller of another, and its lanes."""
+    """Return the loop that knows every road, under the controller of another loop, and its lanes."""
     batch, (before, beyond) = lanes.batch(sensors), lanes.bound.peaks
     edges = np.asarray(lanes.family.values["plant.road.edges"])[:, 0]
     known = {"reference.before": before, "reference.beyond": beyond, "reference.edge": edges}

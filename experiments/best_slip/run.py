@@ -50,7 +50,7 @@ def judged(config: Config, one: Loop, batch: Batch, finer: int = 1) -> Metrics:
 
 
 def contenders(config: Config, sensors: str, unseen: Lanes, own: dict[str, Loop]) -> dict[str, tuple[Loop, Batch]]:
-    """Loops and lanes: untuned, tuned, and what knows each road, with the controller of the fixed slip."""
+    """Return loops and lanes: untuned, tuned, and with known roads under the controller of the fixed slip."""
     batch = unseen.batch(sensors)
     seen = start(config.ranges, config.fixed, sensors, FIXED).sensor
     those = {name: (one, batch) for name, one in untuned(config.ranges, config.fixed, sensors)}
@@ -59,7 +59,7 @@ def contenders(config: Config, sensors: str, unseen: Lanes, own: dict[str, Loop]
 
 
 def by_road(name: str, found: Metrics, unseen: Lanes) -> dict[str, Any]:
-    """Means above the bound [%] on kinds of roads: where the bound is attained, and where nobody attains it."""
+    """Return means above the bound [%] on kinds of roads, with and without a stop that attains the bound."""
     bound, mine = unseen.bound, good(found)
     excess = 100 * (found["stop_distance"] / bound.distance - 1)
     level = unseen.family.values["plant.road.roads.0.D"]
@@ -95,8 +95,8 @@ def halved(config: Config, one: Loop, batch: Batch, found: Metrics, shortest: np
 def of_sensors(
     config: Config, sensors: str, told: Callable[[str], None], carried: dict[str, Loop]
 ) -> tuple[dict[str, Any], dict[str, Metrics], dict[str, Loop]]:
-    """Tune the rules that are to be tuned for these sensors, judge them and those that are carried over, check them:
-    what is said of them, the metrics of every lane, and the loops by rule."""
+    """Tune, judge and check the rules for these sensors. Returns the results, the metrics of every lane, and the
+    loops by rule."""
     fixed, found = config.fixed, {}
     for rule in config.rules[sensors]:
         found[rule] = tuned(config.search, fixed, sensors, rule, config.ranges)
@@ -127,7 +127,8 @@ def of_sensors(
 
 
 def of_bounds(fixed: Fixed) -> dict[str, Any]:
-    """What the bound adds to the distance at the peak's friction alone, and of how many roads what is true."""
+    """Return how much the bound exceeds the distance at the peak's friction alone, and the shares of the kinds of
+    roads."""
     bound = lanes(fixed, fixed.roads.held_out, fixed.roads.seed + 1).bound
     mean, half = interval(bound.distance / bound.friction - 1, fixed.confidence)
     return {

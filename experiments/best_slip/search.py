@@ -43,7 +43,7 @@ class Search:
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """A rule that is tuned; how, and with how many runs' derivatives (starts that had ended are counted, too)."""
+    """A tuned rule, with the number of runs whose derivatives it took. Starts that had ended count, too."""
 
     tuned: Tuned
     tried: Tuned
@@ -56,8 +56,10 @@ class Found:
 
 
 def mean_logarithm(values: Any) -> Any:
-    """Return what is made small of distances in units of their bounds (n,): for all but lanes that hardly stop the mean
-    excess; one of those counts as some five hundred per cent, not as a hundred thousand."""
+    """Return the objective of distances in units of their bounds (n,).
+
+    It is nearly the mean excess. A lane that hardly stops counts as some 500 %, not as 100,000 %.
+    """
     return jnp.mean(jnp.log(values))
 
 
@@ -91,7 +93,7 @@ def tuned(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges)
 
 
 def described(found: Found) -> dict[str, Any]:
-    """Of what a search found, and how."""
+    """Return the result of a search, and how it ended."""
     one = found.tuned
     return {
         "objective": {"before": float(one.objective[0]), "after": float(one.objective[1])},
@@ -131,11 +133,12 @@ def by_cma_es(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ran
 def against_differences(
     search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, one: Loop
 ) -> dict[str, Any]:
-    """How many lanes have, where a search ended, the derivative that central differences of several widths show: of
-    distance/bound, along one random direction in the coordinates of `tune`, in which every component has its share.
+    """Return on how many lanes central differences agree with the derivative at the end of a search.
 
-    Lane by lane, since a mean of differences says nothing once a lane jumps: a latch that takes another maximum. A lane
-    agrees with a width to `agreement` of the derivative, or to 1e-5."""
+    The derivative is that of distance/bound along one random direction in the coordinates of `tune`. The study compares
+    lane by lane: a mean of differences says nothing if a lane jumps, as a latch that takes another maximum. A lane
+    agrees with a width to `agreement` of the derivative, or to 1e-5.
+    """
     known = lanes(fixed, search.roads, fixed.roads.seed)
     given = task(search, fixed, sensors, rule, ranges, known)
     coordinates, solver = parameter_space(one, given["free"]), dataclasses.replace(given["solver"], kinks=True)

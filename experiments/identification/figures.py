@@ -14,7 +14,7 @@ UNITS = ("s", "m")
 
 
 def draw_curves(config: Any, formula: Identified, splines: dict[str, Identified]) -> Any:
-    """Stated curves, and what the tables make of them."""
+    """Draw the stated curves, and their fits to the tables."""
     figure, axes = plot.sheet(1, 2, title="Friction curves from Tables 1 and 2", size=(6, 4))
     s = np.linspace(0, 1, 2001)
     for ax in axes:

@@ -78,14 +78,17 @@ class Config:
 
 
 def holding(config: Config) -> float:
-    """tau* of the mass that is known [N m]."""
+    """Return tau* of the known mass [N m]."""
     rig = MirroredRig(mass=config.known_mass)
     there = rig.output(rig.start(BrakeStart(speed=config.tuned_speeds[-1] / KMH, slip=config.slip)))
     return float(rig.holding(there, config.slip))
 
 
 def loop(config: Config, controller: Any, time_constant: float = 0.0, *, exact: bool = False) -> Loop:
-    """The rig as it is. Time constant 0: no filter; `exact`: the holding torque of the true mass."""
+    """Return the rig with its limits, lag and computer.
+
+    Time constant 0: no filter; `exact`: the holding torque of the true mass.
+    """
     low, high = config.torque
     controller = dataclasses.replace(controller, low=low, high=high)
     filtered = (
@@ -108,13 +111,15 @@ def proportional(config: Config, gain: Any) -> ProportionalFeedback:
 
 
 def start(config: Config) -> Loop:
-    """What is tuned, before."""
+    """Return the loop before its tuning."""
     return loop(config, proportional(config, config.gain), config.filter)
 
 
 def systems(config: Config) -> dict[str, Polytope]:
-    """The linear systems that a certificate is about: the sampled rig with its lag, for a fixed and for a proportional
-    gain, over masses and speeds; for the latter also however fast the speed falls."""
+    """Return the linear systems of the certificates: the sampled rig with its lag, over masses and speeds.
+
+    One is for a fixed gain. The other is for a proportional gain, and for any fall of the speed.
+    """
     model = SlipModel(slip=config.slip, actuator=Lag(time_constant=config.lag), sampling=Sampling(period=config.period))
     low, high = (speed / KMH for speed in config.proved_speeds)
     scaled = SpeedScaled(model=model, reference_speed=high)
@@ -151,7 +156,7 @@ def lmi_gains(config: Config) -> np.ndarray:
 
 
 def best_lmi(config: Config, batch: Batch) -> tuple[float, float]:
-    """Of these gains the one that overshoots least on the rig as it is."""
+    """Return the one of these gains that overshoots least on the rig."""
     gains, one = lmi_gains(config), loop(config, StateFeedback())
     solver = FixedStep(step=config.step, duration=config.duration)
 
@@ -165,8 +170,10 @@ def best_lmi(config: Config, batch: Batch) -> tuple[float, float]:
 
 
 def contenders(config: Config, found: Loop, lmi: tuple[float, float]) -> dict[str, tuple[Loop, str]]:
-    """What is compared, and the kind of its certificate. The last rows are the ablation: the cure without one of its
-    ingredients."""
+    """Return the compared loops, and the kind of certificate of each.
+
+    The last rows are the cure without one of its ingredients.
+    """
     k = np.asarray(found.controller.controller.gain)  # pyright: ignore[reportAttributeAccessIssue]
     time_constant = float(found.reference.time_constant)  # pyright: ignore[reportAttributeAccessIssue]
     slowest = k * config.proved_speeds[0] / config.proved_speeds[1]
@@ -195,7 +202,7 @@ def contenders(config: Config, found: Loop, lmi: tuple[float, float]) -> dict[st
 
 
 def judged(config: Config, one: Loop, system: Polytope, batch: Batch) -> tuple[dict[str, Any], Certificate]:
-    """Worst over the lanes that do not diverge, and what is proved of the gain."""
+    """Return the worst metrics of the lanes that do not diverge, and the certificate of the gain."""
     solver = FixedStep(step=config.step, duration=config.duration)
     runs = jax.device_get(jax.jit(lambda one: run_batch(one, batch, solver, BRAKING))(one))
     proof = certify(feedback_gain(one, system.states), system, fastest=True)
@@ -215,20 +222,20 @@ def judged(config: Config, one: Loop, system: Polytope, batch: Batch) -> tuple[d
 
 
 def weak(config: Config, those: dict[str, tuple[Loop, str]]) -> list[dict[str, Any]]:
-    """Worst overshoot of each controller where one thing is wrong."""
+    """Return the worst overshoot of each controller under one deviation."""
     solver = FixedStep(step=config.step, duration=config.longer)
     return [{"controller": n, **weak_spots(one, config.box, solver, config.seeds)} for n, (one, _) in those.items()]
 
 
 def asked(config: Config, one: Loop) -> dict[str, tuple[float, float]]:
-    """Least and greatest torque that the controller asks for [N m]: inside the limits, the linear model holds."""
+    """Return least and greatest torque that the controller commands [N m]; inside the limits the linear model holds."""
     solver = FixedStep(step=config.step, duration=config.longer)
     outside = dataclasses.replace(config.box, speeds=(config.drawn[-1][1],))
     return {"in the box": torques(one, config.box, solver), "from 70 km/h": torques(one, outside, solver)}
 
 
 def summary(config: Config, found: Tuned, proof: Certificate) -> dict[str, Any]:
-    """Everything with which the cure can be simulated again, and what is proved of it."""
+    """Return everything to simulate the cure again, and its certificate."""
     plain = {path: np.asarray(value, float).tolist() for path, _, value in parameters(found.loop)}
     finite = {path: value for path, value in plain.items() if np.isfinite(value).all()}
     return {

@@ -45,7 +45,7 @@ def near_corner(config: Config, speed: str, corner: dict[str, float]) -> dict[st
 
 
 def judged(config: Config, speed: str, name: str, one: Loop) -> dict[str, Any]:
-    """Return what corners and points of the box say of a loop, and of a tuned estimator that never begins anew."""
+    """Return the judgement of a loop on corners and points of the box, and of a tuned estimator that never restarts."""
     tuned = name.startswith("tuned")
     samples = config.judging.samples if tuned else config.judging.fewer
     found = {

@@ -22,7 +22,7 @@ Range = tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Fixed:
-    """What is the same in every run."""
+    """The numbers that are equal in every run."""
 
     torque: Range = (0.0, 9.03)  # N m
     known_mass: float = 5.75  # kg, whose holding torque is fed forward
@@ -37,8 +37,11 @@ class Fixed:
 
 @dataclasses.dataclass(frozen=True)
 class Box:
-    """Ranges. Factors multiply the values of Maeda and Sugiura: the height of the friction curve and the place of its
-    peak (mu(slip) = height mu0(slip/place)), and the wheel's inertia."""
+    """Ranges of the unknowns.
+
+    Factors multiply the values of Maeda and Sugiura. They are the height of the friction curve, the place of its peak
+    (mu(slip) = height mu0(slip/place)), and the wheel's inertia.
+    """
 
     mass: Range = (5.3, 6.2)  # kg
     speed: Range = (20.0, 70.0)  # km/h, of the start
@@ -52,7 +55,7 @@ class Box:
     bias: Range = (-0.1, 0.1)  # m/s^2, of the accelerometer's deceleration
 
     def ranges(self, speed: str) -> dict[str, Range]:
-        """Those that matter where the vehicle's speed is known, or estimated."""
+        """Return the ranges that matter under a known, or an estimated, speed."""
         whose = {"first": KNOWN, "last": KNOWN, "bias": ESTIMATED}
         return {name: r for name, r in dataclasses.asdict(self).items() if whose.get(name, speed) == speed}
 
@@ -71,21 +74,21 @@ def drawn(box: Box, speed: str, count: int, seed: int) -> dict[str, np.ndarray]:
 
 
 def spread(box: Box, speed: str, count: int, seed: int) -> dict[str, np.ndarray]:
-    """Points of a scrambled Sobol sequence: what is tuned on."""
+    """Return points of a scrambled Sobol sequence, for the tuning."""
     ranges = box.ranges(speed)
     points = qmc.Sobol(len(ranges), rng=np.random.default_rng(seed)).random(count)
     return {n: low + (high - low) * points[:, i] for i, (n, (low, high)) in enumerate(ranges.items())}
 
 
 def corners(box: Box, speed: str, seeds: int = 1) -> dict[str, np.ndarray]:
-    """All of them, each so many times, for as many seeds of the noise."""
+    """Return all corners, each as often as there are seeds of the noise."""
     ranges = box.ranges(speed)
     points = np.repeat(np.array(list(itertools.product(*ranges.values()))), seeds, axis=0)
     return dict(zip(ranges, points.T, strict=True))
 
 
 def columns(points: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Parameters of the loop by path, for points by name; what is not named is nominal."""
+    """Return parameters of the loop by path, for points by name. Unnamed parameters are nominal."""
     at = {**{name: np.full(1, value) for name, value in NOMINAL.items()}, **points}
     h, c = at["height"], at["place"]
     road = {"w1": RIG.w1 * h / c, "w2": RIG.w2 * h / c**2, "w3": RIG.w3 * h / c**3, "w4": RIG.w4 * h}

@@ -94,7 +94,7 @@ def document(one: Loop) -> dict[str, Any]:
 
 
 def loop_of(document: dict[str, Any]) -> Loop:
-    """Return the loop of a document, as it is judged: with its noises and the quantisation of the wheel's speed."""
+    """Return the loop of a document for the judgement, with its noises and the quantisation of the wheel's speed."""
     kinds, values = document["kinds"], {path: one["value"] for path, one in document["parameters"].items()}
     windup = {}
     if any(path.startswith("controller.controller.antiwindup") for path in values):

@@ -50,8 +50,8 @@ SEEDS = 2
 
 
 def degradation(one: Loop, speed: str, config: Judging, count: int) -> Maps:
-    """Overshoot [%] over pairs of parameters around the nominal point, the worst of SEEDS noises, drawn for each point
-    (count, count)."""
+    """Return the overshoot [%] over pairs of parameters around the nominal point (count, count): the worst of SEEDS
+    noises, drawn for each point."""
     found = {}
     for pair in PAIRS[speed]:
         x, y = np.linspace(*pair.x_range, count), np.linspace(*pair.y_range, count)
@@ -121,7 +121,7 @@ def distributions(ones: dict[str, Loop], speed: str, box: Box, fixed: Fixed, con
 
 
 def traces(ones: dict[str, Loop], speed: str) -> Any:
-    """Slip and torque at the nominal point and where much is wrong."""
+    """Draw slip and torque at the nominal point and under several errors."""
     wrong = {"mass": 6.2, "speed": 70.0, "height": 1.1, "inertia": 1.1, "lag": 2e-3, "delay": 1e-3}
     wrong |= {"first": -0.03, "last": -0.03} if speed == KNOWN else {"bias": 0.1}
     titles = ("nominal, 50 km/h", "70 km/h and much wrong")

@@ -38,7 +38,8 @@ def stopping_time(points: dict[str, np.ndarray], fixed: Fixed) -> np.ndarray:
 
 
 def error(points: dict[str, np.ndarray], speed: str, fixed: Fixed, t: np.ndarray) -> np.ndarray:
-    """e at the times t (k, n), (k, n): of an estimated speed, that which the bias alone makes."""
+    """Return the relative error e of the speed at the times t (k, n), (k, n). For an estimated speed, the bias
+    alone makes it."""
     if speed == KNOWN:
         return points["last"] + (points["first"] - points["last"]) * np.exp(-t / fixed.drift)
     left = points["speed"] / KMH - t * (points["speed"] - fixed.end) / KMH / stopping_time(points, fixed)
@@ -46,8 +47,8 @@ def error(points: dict[str, np.ndarray], speed: str, fixed: Fixed, t: np.ndarray
 
 
 def floor(points: dict[str, np.ndarray], speed: str, fixed: Fixed, *, two_sided: bool = False) -> np.ndarray:
-    """Overshoot that the error of the speed alone makes, while the target is held (n,); with `two_sided` the deviation
-    either way."""
+    """Return the overshoot that the error of the speed alone makes, while the target is held (n,); with `two_sided`
+    the deviation to either side."""
     t = np.linspace(HELD, stopping_time(points, fixed), INSTANTS)
     errors = error(points, speed, fixed, t)
     worst = np.abs(errors) if two_sided else np.maximum(0.0, -errors)

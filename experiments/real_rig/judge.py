@@ -82,7 +82,7 @@ def _block(one: Loop, lanes: Batch, at: np.ndarray, config: Judging) -> Any:
 
 
 def spots(speed: str) -> dict[str, dict[str, np.ndarray]]:
-    """The points of each weak spot, by its name: all masses and speeds, with one thing that is not nominal."""
+    """Return the points of each weak spot by its name: all masses and speeds, with one deviation."""
     mine = {name: at for name, at in SPOTS.items() if _fits(at, speed)}
     axes = np.meshgrid(MASSES, SPEEDS, range(SEEDS), indexing="ij")
     mass, start, _ = (axis.ravel() for axis in axes)
@@ -97,7 +97,7 @@ def _fits(at: dict[str, float], speed: str) -> bool:
 
 
 def weak_spots(one: Loop, speed: str, config: Judging) -> dict[str, float]:
-    """Worst overshoot [%] where one thing is wrong."""
+    """Return the worst overshoot [%] under one deviation."""
     those = spots(speed)
     together = {name: np.concatenate([at[name] for at in those.values()]) for name in next(iter(those.values()))}
     overshoot = runs(one, together, config, config.seed + 1)["overshoot"].reshape(len(those), -1)
@@ -155,7 +155,7 @@ def quantiles(values: np.ndarray) -> dict[str, float]:
 
 
 def seconds(time: float) -> str:
-    """Return a settling time as text; one that is longer than a run is that of runs which never settle."""
+    """Return a settling time as text; times beyond a run are of runs that never settle."""
     return f"{time:.3f}" if time <= LONGEST else "never"
 
 

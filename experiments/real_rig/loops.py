@@ -16,15 +16,17 @@ from experiments.real_rig.box import KMH, KNOWN, NOMINAL, Fixed
 
 
 def holding(fixed: Fixed) -> float:
-    """tau* of the mass that is known [N m]."""
+    """Return tau* of the known mass [N m]."""
     rig = MirroredRig(mass=fixed.known_mass)
     there = rig.output(rig.start(BrakeStart(speed=NOMINAL["speed"] / KMH, slip=fixed.slip)))
     return float(rig.holding(there, fixed.slip))
 
 
 def sensor(fixed: Fixed, speed: str, estimator: Any = None, *, smooth: bool = False) -> Series:
-    """What is measured. `smooth`: noise of the same size in place of the quantisation of the wheel's speed, which has
-    no useful derivative."""
+    """Return the sensor.
+
+    `smooth`: noise of the same size replaces the quantisation of the wheel's speed, which has no useful derivative.
+    """
     period = fixed.period
     steps = Quantisation(wheel_speed=fixed.quantum)
     if smooth:
@@ -62,7 +64,7 @@ def located(one: Loop) -> Loop:
 
 
 def with_truth(one: Loop) -> Loop:
-    """The same loop that sees the true speed of the vehicle, with the same noise of the wheel's."""
+    """Return the same loop with the true speed of the vehicle, and the same noise of the wheel's speed."""
     wheel = one.sensor.blocks[:2]  # pyright: ignore[reportAttributeAccessIssue]
     return dataclasses.replace(one, sensor=Series(blocks=(*wheel, DriftingSpeed())))
 

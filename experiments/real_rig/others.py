@@ -46,8 +46,10 @@ class Others:
 
 
 class Score:
-    """The objective of the tuning of a loop, on the rig with its quantisation: CVaR over the box of IAE plus overshoot,
-    or the deviation to both sides, above its floor. It counts the runs."""
+    """The tuning's objective of a loop, on the rig with its quantisation. It counts the runs.
+
+    It is the CVaR over the box of IAE plus the overshoot above its floor, or plus the deviation to both sides.
+    """
 
     def __init__(self, config: Others, box: Box, fixed: Fixed, speed: str, weights: Any, judging: Judging):
         """On so many points, spread evenly. `weights`: of IAE, and of "overshoot" or "deviation"."""
@@ -97,8 +99,11 @@ def _at(one: Loop, coordinates: Any, z: Any) -> Loop:
 
 
 def designs(config: Others, box: Box, fixed: Fixed) -> dict[str, list[np.ndarray]]:
-    """Gains by the robust designs of the package, for a grid of what they leave open. `wide` also has friction (height
-    and place), inertia, and the speed's error, which is one of the input's gain, as ranges."""
+    """Return gains of the package's robust designs, for a grid of their free settings.
+
+    `wide` also has friction (height and place), inertia, and the speed's error as ranges. The error is one of the
+    input's gain.
+    """
     speeds = (fixed.end / KMH, box.speed[1] / KMH)
     narrow = {"plant.mass": box.mass, "speed": speeds}
     seen = 1 + box.first[1]
@@ -137,7 +142,7 @@ def contenders(
     score: Score,
     told: Callable[[str], None],
 ) -> dict[str, tuple[Loop, int]]:
-    """Loops by name, and the runs that it took to find each. `robust`: what `designs` found."""
+    """Return loops by name, and the number of runs behind each. `robust`: the gains of `designs`."""
 
     def feedback(gain: Any) -> Loop:
         return loop(fixed, StateFeedback(gain=np.asarray(gain, float)), speed, estimator=estimator)
@@ -170,7 +175,7 @@ def contenders(
 
 
 def proportional_integral(config: Others) -> tuple[PID, Free]:
-    """The PI that is searched for: where it starts, and what is free."""
+    """Return the start of the PI's search, and its ranges."""
     pi = PID(
         kp=config.pi[0],
         ki=config.pi[1],
@@ -182,7 +187,7 @@ def proportional_integral(config: Others) -> tuple[PID, Free]:
 
 
 def sliding(config: Others) -> tuple[SlidingMode, Free]:
-    """The sliding mode that is searched for."""
+    """Return the start of the sliding mode's search, and its ranges."""
     mode = SlidingMode(gain=config.sliding[0], boundary=config.sliding[1])
     names = zip(("gain", "boundary"), config.sliding_ranges, strict=True)
     return mode, {f"controller.controller.{name}": ends for name, ends in names}

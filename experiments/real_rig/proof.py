@@ -104,7 +104,7 @@ def covering(config: Proving, box: Box, fixed: Fixed, kind: str, cell: dict[str,
 
 
 def proofs(config: Proving, box: Box, fixed: Fixed, ones: dict[str, Loop]) -> dict[str, dict[str, Any]]:
-    """What is proved of each: in how many cells there is a common P, and the slowest decay that it proves."""
+    """Return the proof of each loop: the number of cells with a common P, and the slowest decay that it proves."""
     kinds = {name: found for name, one in ones.items() if (found := gain(one)) is not None}
     said: dict[str, dict[str, Any]] = {
         name: {"said": "not linear", "cells": 0, "of": 0} for name in ones if name not in kinds

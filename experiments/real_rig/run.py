@@ -68,7 +68,7 @@ def scored(config: Config, speed: str, weights: Any = ONE_SIDED) -> Score:
 def compared(
     config: Config, speed: str, robust: dict[str, Any], stages: dict[str, Tuned], told: Any
 ) -> dict[str, tuple[Loop, int]]:
-    """All loops of one kind of speed by name, with what it cost to find each; others see the same estimated speed."""
+    """Return all loops of one kind of speed by name, with the runs behind each. All have the same estimated speed."""
     best: Any = stages["CVaR"].loop
     estimator = None if speed == KNOWN else best.sensor.blocks[-1]
     found = contenders(config.others, config.fixed, speed, robust, estimator, scored(config, speed), told)
@@ -105,7 +105,7 @@ def printed(speed: str, results: dict[str, dict[str, Any]]) -> None:
 
 
 def row(one: dict[str, Any]) -> dict[str, Any]:
-    """What a line of the table says."""
+    """Return a line of the table."""
 
     def interval(name: str) -> str:
         p = one["box"][name]
@@ -136,7 +136,7 @@ def row(one: dict[str, Any]) -> dict[str, Any]:
 def of_speed(
     config: Config, speed: str, robust: dict[str, Any], told: Any
 ) -> tuple[dict[str, Tuned], dict[str, Loop], dict[str, Any]]:
-    """Tune, compare, judge, prove: stages of the tuning, loops, and what is said of each."""
+    """Tune, compare, judge, prove. Returns the stages of the tuning, the loops, and the results of each."""
     stages = tuned(config.tuning, config.box, config.fixed, speed, told)
     those = compared(config, speed, robust, stages, lambda name: told(f"{speed}, found: {name}"))
     loops = {name: one for name, (one, _) in those.items()}
@@ -188,7 +188,7 @@ def file_name(name: str) -> str:
 
 
 def described(stages: dict[str, Tuned]) -> dict[str, Any]:
-    """What the descents found, and how."""
+    """Return the results of the descents."""
     return {
         name: {
             "objective": list(found.objective),

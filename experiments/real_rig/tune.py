@@ -55,7 +55,7 @@ class Tuning:
 
 
 class Above:
-    """An aggregate of what the lanes' numbers exceed their floors by: what a controller can do something about."""
+    """An aggregate of the lanes' numbers above their floors. A controller can reduce these."""
 
     def __init__(self, inner: Any, floors: np.ndarray):
         """`floors`: of the weighted sum of the metrics (lanes,)."""
@@ -67,7 +67,7 @@ class Above:
 
 
 def start(config: Tuning, fixed: Fixed, speed: str) -> Loop:
-    """What is tuned, before: with noise in place of the quantisation."""
+    """Return the loop before its tuning, with noise in place of the quantisation."""
     windup = BackCalculation(tracking_time=config.tracking_time)
     controller = ProportionalFeedback(gain=np.array(config.gain), antiwindup=windup)
     target = LimitedSlip(slip=fixed.slip, rate=config.rate, time_constant=config.time_constant)
@@ -93,7 +93,7 @@ def lanes(
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A search: what of the lanes' numbers is minimised, on how many of them, from how many starts, for how long."""
+    """A search: the objective of the lanes, their number, the starts and the iterations."""
 
     name: str
     aggregate: Any
@@ -106,7 +106,7 @@ class Stage:
 def searched(
     stage: Stage, subject: Loop, config: Tuning, box: Box, fixed: Fixed, speed: str, progress: Callable[[str], None]
 ) -> Tuned:
-    """What a search finds from a loop on."""
+    """Return the result of a search from a loop."""
     over, floors = lanes(config, box, fixed, speed, stage.lanes, stage.weights)
     stopping = Stopping(change=1e-4, iterations=stage.iterations)
     return tune(
@@ -129,8 +129,11 @@ def searched(
 def tuned(
     config: Tuning, box: Box, fixed: Fixed, speed: str, progress: Callable[[str], None] = lambda line: None
 ) -> dict[str, Tuned]:
-    """The best of several starts on few lanes, under CVaR; from there on many under CVaR; from there under the smooth
-    worst and, where the speed is known, CVaR of the deviation to both sides."""
+    """Return the results of all stages.
+
+    Several starts run on few lanes under CVaR. The best of them goes on with many lanes under CVaR, then under the
+    smooth worst. Where the speed is known, CVaR of the deviation to both sides follows.
+    """
     risk, worst = CVaR(level=config.level), SmoothWorst(softness=config.softness)
     lanes, steps = config.lanes, config.iterations
     given = (config, box, fixed, speed, progress)

@@ -67,8 +67,8 @@ def noisy_loop(config: Config, car: QuarterCar, noise: float, reference: Any, ki
 
 
 def noisy(config: Config, loops: list[Loop], duration: float) -> tuple[Any, Any]:
-    """Distance covered [m] and whether the car stopped, by loop and seed. A car that has not stopped counts with the
-    way it has come."""
+    """Return the distance [m] and whether the car stopped, by loop and seed. For a car still moving it is the
+    distance so far."""
     keys = jax.random.split(jax.random.key(config.seed), config.seeds)
     solver = FixedStep(step=config.step, duration=duration)
     one = jax.vmap(lambda loop, key: measure(loop, solver, OBJECTIVES, key=key), (None, 0))
@@ -79,7 +79,7 @@ def noisy(config: Config, loops: list[Loop], duration: float) -> tuple[Any, Any]
 
 
 def statistics(distance: Any, stopped: Any) -> dict[str, Any]:
-    """Of one loop over the seeds."""
+    """Return the statistics of one loop over the seeds."""
     mean, deviation, most = (float(f(distance)) for f in (np.mean, lambda x: np.std(x, ddof=1), np.max))
     return {"mean [m]": mean, "deviation [m]": deviation, "worst [m]": most, "stopped": int(stopped.sum())}
 

@@ -91,8 +91,10 @@ FREE = ("mount", "reach", "offset", "arm_mass", "constant", "gear")
 
 
 def bounds(config: Config, machine: Machine) -> Any:
-    """For each rider the largest multiple that any control recovers in the linear model: the lesser of what the voltage
-    allows without a limit of the current, and the current without one of the voltage."""
+    """Return for each rider the largest multiple that any control recovers in the linear model.
+
+    It is the lesser of two: with a limit of the voltage only, and with one of the current only.
+    """
 
     def one(rider: Any) -> Any:
         plant = dataclasses.replace(machine.plant(), rider_mass=rider)
@@ -106,7 +108,7 @@ def bounds(config: Config, machine: Machine) -> Any:
 
 
 def limits(config: Config, shape: str) -> dict[str, tuple[float, float]]:
-    """Ranges of what is free in a machine."""
+    """Return the ranges of a machine."""
     return {name: getattr(config, shape if name == "offset" else name) for name in FREE}
 
 
@@ -131,7 +133,7 @@ def best_bound(config: Config, machine: Machine, shape: str) -> Machine:
 
 
 def counted(config: Config, loop: Loop, riders: Any, most: float) -> list[Reach]:
-    """For each rider the largest multiple that is recovered, of so many up to `most`, by running them."""
+    """Return for each rider the largest recovered multiple, of so many up to `most`, by runs."""
     multiples = np.linspace(0.0, most, config.judged_multiples + 1)[1:]
     solver = FixedStep(step=config.judged_step, duration=config.judged_duration)
     return largest_recovered_multiples(loop, {"plant.rider_mass": np.asarray(riders)}, DIRECTION, multiples, solver)
@@ -217,7 +219,7 @@ def described(config: Config, machine: Machine) -> dict[str, Any]:
 
 
 def judged(config: Config, machine: Machine) -> dict[str, Any]:
-    """What a tuned machine does in nonlinear runs, and what is proved of its gain."""
+    """Return a tuned machine's recovered multiples in nonlinear runs, and the certificate of its gain."""
     loop = machine.closed_loop()
     riders = np.array([*config.riders, 50.0])
     reaches = counted(config, loop, riders, float(jnp.max(bounds(config, machine))))

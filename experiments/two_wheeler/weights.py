@@ -76,8 +76,10 @@ def tuned(config: Config) -> Any:
 
 
 def possible(config: Config) -> tuple[float, tuple[float, float]]:
-    """The share of the box by area from which some control at 48 V recovers, by the linear model, and t, p [rad]
-    of |theta0/t + phi0/p| <= 1."""
+    """Return the share of the box, by area, from which some control at 48 V recovers in the linear model.
+
+    Also returns t, p [rad] of the strip |theta0/t + phi0/p| <= 1.
+    """
     loop = load("arm-hanging").loop
     a, b = BalanceModel(plant=loop.plant).matrices()
     limit, unit = float(loop.actuator.high), np.eye(6)
@@ -88,7 +90,7 @@ def possible(config: Config) -> tuple[float, tuple[float, float]]:
 
 
 def judged(config: Config, gain: Any) -> tuple[Basin, dict[str, Any]]:
-    """Map of a gain, and what is proved of it over the riders."""
+    """Return the map of a gain, and its certificate over the riders."""
     loop = replace(load("arm-hanging").loop, {"controller.gain": np.asarray(gain)})
     solver = FixedStep(step=config.step, duration=config.duration)
     cells = Cells(-config.box, config.box, config.starts)

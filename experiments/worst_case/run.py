@@ -63,7 +63,7 @@ def loops() -> dict[str, Loop]:
 
 
 def found(config: Config, one: Loop) -> WorstCase:
-    """By gradients."""
+    """Return the worst case by gradients."""
     return worst_case(
         one,
         over={path: (low, high) for path, low, high in config.box},
@@ -103,7 +103,7 @@ def sampled(config: Config, one: Loop) -> dict[str, np.ndarray]:
 
 
 def proof(config: Config, one: Loop) -> Certificate:
-    """Of the linear loop over the same box, down to the speed at which a run ends."""
+    """Return the certificate of the linear loop over the same box, down to the speed at which a run ends."""
     lag, controller = config.box[3][0], one.controller
     assert lag == "actuator.time_constant"
     names = {"initial.speed": "speed"}
@@ -120,7 +120,7 @@ def proof(config: Config, one: Loop) -> Certificate:
 
 
 def seen(config: Config, one: Loop) -> Run:
-    """With its trajectory."""
+    """Return the run with its trajectory."""
     return rollout(one, FixedStep(step=config.step, duration=config.duration), BRAKING)
 
 
