@@ -39,11 +39,11 @@ class Family(NamedTuple):
     time: np.ndarray
 
     def batch(self) -> Batch:
-        """Lanes that count relative to their shortest distance."""
+        """Return lanes that count relative to their shortest distance."""
         return Batch(self.values, weights=1 / self.distance, durations=1.3 * self.time + 1.0)
 
     def with_paper(self, share: float) -> Batch:
-        """The same, and the paper's own car and road, which count as much as this share of all."""
+        """Return these lanes, and the paper's own car and road, which has this share of the whole weight."""
         road, v, n = MagicFormula(), 100 / plot.KMH, len(self.time)
         own = {"plant.mass": 15.0, "initial.speed": v, "plant.road.edges": [1e4]}
         for i in (0, 1):
@@ -55,13 +55,16 @@ class Family(NamedTuple):
 
 
 def stiffness(peak_slip: float, shape: float, curvature: float) -> float:
-    """B of a Magic Formula whose peak is at this slip: C arctan(x - E (x - arctan x)) = pi/2 at x = B slip."""
+    """Return B of a Magic Formula whose peak is at this slip.
+
+    C arctan(x - E (x - arctan x)) = pi/2 holds at x = B slip.
+    """
     level = math.tan(math.pi / (2 * shape))
     return brentq(lambda x: x - curvature * (x - math.atan(x)) - level, 0.0, 1e3) / peak_slip
 
 
 def family(config: Roads, count: int, seed: int) -> Family:
-    """A scrambled Sobol sequence over everything that varies; frictions of patches and peak slips in logarithms."""
+    """Return roads and cars of a scrambled Sobol sequence. Frictions of patches and peak slips are in logarithms."""
     u = qmc.Sobol(9, rng=np.random.default_rng(seed)).random(count).T
 
     def between(ends: tuple[float, float], part: np.ndarray, *, log: bool = False) -> np.ndarray:

@@ -68,8 +68,10 @@ def worst_of(logs: dict[str, Log], name: str) -> np.ndarray:
 
 
 def excesses(config: Config, logs: dict[str, Log], at_rest: float) -> list[dict[str, Any]]:
-    """Return the excess [%] of each search at each cost (median, least and greatest of the seeds), and its cost to
-    come near the greatest excess."""
+    """Return the excess [%] of each search at each cost, and the cost at which it comes near the greatest excess.
+
+    The excess is a median, least and greatest over the seeds.
+    """
     most = max(log.overshoots.max() for log in logs.values())
     near, rows = at_rest + NEAR * (most - at_rest), []
     for name, log in logs.items():

@@ -201,8 +201,7 @@ def summary(name: str, found: Identified, start: dict[str, Any] | None = None) -
 
 
 def directions(found: Identified, most: int = 6) -> list[dict[str, Any]]:
-    """Return the directions of the parameters that the data determine least, first the least; an infinite spread is
-    None."""
+    """Return the directions of the parameters, first the least determined one. An infinite spread becomes None."""
     chosen = found.uncertainty.directions[::-1][:most]
     short = [one.describe(0.15).replace("plant.", "").replace("road.", "") for one in chosen]
     spreads = [one.spread if np.isfinite(one.spread) else None for one in chosen]

@@ -94,8 +94,11 @@ def lines(config: Config, kept: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def line(kept: dict[str, Any], accuracy: str, target: float) -> dict[str, Any]:
-    """Rollouts to a target; None where it was not reached. A ratio is None where derivatives did not reach it, and a
-    lower bound where the search without them did not, and counts as what it spent."""
+    """Return the rollouts to a target; None if a search does not reach it.
+
+    A ratio is None if gradients did not reach the accuracy. If the search without gradients did not, the ratio is a
+    lower bound, from all its rollouts.
+    """
     counts = {who: searches.needed(trace, target) for who, trace in kept["traces"].items()}
     rollouts = {who: n * kept["price"] if who in WITH else n for who, n in counts.items()}
     tuned = [who for who in counts if who.startswith(CMA_ES)]
@@ -120,7 +123,7 @@ def line(kept: dict[str, Any], accuracy: str, target: float) -> dict[str, Any]:
 
 
 def gains(config: Config, found: dict[str, Tuned]) -> list[dict[str, Any]]:
-    """The gain that each problem on the rig ended with, what it does, and what is proved of it without the lag."""
+    """Return the final gain of each problem on the rig, its metrics, and its certificate without the lag."""
     rows = []
     for name, one in found.items():
         if not isinstance(one.loop.controller, StateFeedback):

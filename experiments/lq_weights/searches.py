@@ -73,7 +73,7 @@ class Counted:
         return self.each(np.asarray(z, float)[None])[0]
 
     def each(self, points: np.ndarray) -> list[float]:
-        """At several points, one after the other as far as it is counted."""
+        """Return the values at several points, which run together and count one after the other."""
         seen = jax.device_get(self._seen(jnp.asarray(points)))
         return [self._counted(*one) for one in zip(points, seen.objective, seen.diverged, strict=True)]
 

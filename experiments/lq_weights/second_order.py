@@ -59,7 +59,7 @@ class Counted:
         self.begin(np.inf)
 
     def begin(self, budget: float) -> None:
-        """Forget what was asked, and allow so many gradients."""
+        """Start a new count of gradients, with this budget."""
         self.budget, self.spent, self.trace = budget, 0.0, []
         self.best: Any = None
         self._asked: Any = None

@@ -201,7 +201,8 @@ SINGLE = (
 
 
 def changed(recorded: RecordedRun, effect: Effect) -> RecordedRun:
-    """The run with the parts and starting values of an effect. The lag starts anew: a fit may end at its limit."""
+    """Return the run with the parts and starting values of an effect. The lag gets its first value again: a fit may
+    end at its limit."""
     if effect.plant is not None:
         recorded = replace(recorded, {"loop.plant": effect.plant(recorded.loop.plant)})
     return replace(recorded, {"loop.plant.brake_rate": 300.0, **effect.parts, **effect.start})
@@ -268,8 +269,10 @@ def effects(first: Record, second: Record, rig: Any) -> list[dict[str, Any]]:
 
 
 def from_ten_starts(first: Record, second: Record, rig: LabRig) -> list[dict[str, Any]]:
-    """The minimum that each of ten starts reaches, of the rigid and the compliant tyre, fitted to half of experiment 1
-    and to all of it, best first; and its errors in the second half and in experiment 2."""
+    """Return the minima of ten starts, best first, and their errors in the second half and in experiment 2.
+
+    Rigid and compliant tyre are fitted to half of experiment 1 and to all of it.
+    """
     free, rows = {path: lab_rig.PARAMETER_RANGES[path] for path in lab_rig.FREE}, []
     for until, fitted in ((HALF, "first half"), (math.inf, "all")):
         for tyre, plant, more in (("rigid", rig, {}), ("compliant", as_compliant(rig), SINGLE[-1].free)):
@@ -293,10 +296,10 @@ def from_ten_starts(first: Record, second: Record, rig: LabRig) -> list[dict[str
 
 
 def diagnosis(first: Record, second: Record, rig: LabRig, found: Identified) -> list[dict[str, Any]]:
-    """The parameters that experiment 2 alone asks for, after it has judged, beside those of experiment 1; and how well
-    each set follows both experiments under their commands.
+    """Return the parameters that fit experiment 2 alone, beside those of experiment 1.
 
-    A diagnosis only: no number of the identified rig comes from here."""
+    Also returns how well each set follows both experiments under their commands. No number of the identified rig comes from here.
+    """
     free = {path: lab_rig.PARAMETER_RANGES[path] for path in lab_rig.FREE}
     start = with_values(lab_rig.build_run(second, True, rig), found.values)
     other = fit_record(start, free, second, starts=[{}, *lab_rig.STARTS[1:]])
@@ -388,7 +391,7 @@ def loop_in(around: Mapping[str, Any], parts: Mapping[str, Any]) -> Loop:
 
 
 def old_controllers(config: Config, rig: LabRig, dead: DeadTime) -> list[dict[str, Any]]:
-    """What the controllers of the earlier pages do on each rig."""
+    """Return the metrics of the earlier pages' controllers on each rig."""
     rows, solver = [], FixedStep(step=config.controllers_step, duration=8.0)
     for name, parts in torque_controllers().items():
         for where, around in surroundings(rig, dead).items():

@@ -114,8 +114,10 @@ def _worst(runs: Any, lanes: np.ndarray) -> float | None:
 
 
 def unlimited(one: Loop) -> Loop:
-    """The same loop, its torque limits moved from the controller into the actuator, where they do the same (there is no
-    anti-windup): what the controller asks for is then seen."""
+    """Return the same loop with its torque limits in the actuator.
+
+    The limits do the same there, since there is no anti-windup. So the run shows the commanded torque.
+    """
     inner = one.controller.controller  # pyright: ignore[reportAttributeAccessIssue]
     limits = Limits(low=inner.low, high=inner.high)
     free = dataclasses.replace(inner, low=-np.inf, high=np.inf)

@@ -61,7 +61,7 @@ def is_proved(
 
 
 def greatest_that_holds(config: Config, low: float, high: float, holds: Callable[[float], bool]) -> float:
-    """Return the greatest number found by bisection of which `holds` is true; `low` if it is true of none above."""
+    """Return by bisection the greatest number for which `holds` is true; `low` if it is true for none above."""
     for _ in range(config.halvings):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if holds(middle) else (low, middle)
