@@ -298,7 +298,8 @@ def from_ten_starts(first: Record, second: Record, rig: LabRig) -> list[dict[str
 def diagnosis(first: Record, second: Record, rig: LabRig, found: Identified) -> list[dict[str, Any]]:
     """Return the parameters that fit experiment 2 alone, beside those of experiment 1.
 
-    Also returns how well each set follows both experiments under their commands. No number of the identified rig comes from here.
+    Also returns how well each set follows both experiments under their commands. No number of the identified rig
+    comes from here.
     """
     free = {path: lab_rig.PARAMETER_RANGES[path] for path in lab_rig.FREE}
     start = with_values(lab_rig.build_run(second, True, rig), found.values)
