@@ -53,7 +53,8 @@ def proof_document(
     **values: Any,
 ) -> JsonObject:
     """Return the JSON document of a proof; `values` are further arguments of `describe_proof`."""
-    document = console.document(scenario, proving.describe_proof(task, proof, **values), "cvxpy", "clarabel", "scipy")
+    values = proving.describe_proof(task, proof, **values)
+    document = console.document("design", scenario, values, "cvxpy", "clarabel", "scipy")
     return document | {"files": {"out": str(out)} if out and proof else {}}
 
 

@@ -21,7 +21,7 @@ from diffabs.cli import progress
 from diffabs.config.values import ScenarioError
 from diffabs.core.types import JsonObject
 from diffabs.roads.sign import find_wrong_sign
-from diffabs.runtime import files, interrupt, provenance, stopwatch
+from diffabs.runtime import documents, files, interrupt, provenance, stopwatch
 from diffabs.scenario import outside
 from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import Scenario, dump, load, names
@@ -120,9 +120,10 @@ def describe_source(scenario: Scenario) -> JsonObject:
     return {"scenario": scenario.name, "model": describe_model(scenario), "made": describe_run()}
 
 
-def document(scenario: Scenario, values: JsonObject, *packages: str) -> JsonObject:
+def document(kind: str, scenario: Scenario, values: JsonObject, *packages: str) -> JsonObject:
     """Return the JSON document of a result: its source, its values, the versions of `packages`, and no files yet."""
-    return {**describe_source(scenario), **values, "versions": provenance.versions(*packages), "files": {}}
+    content = {**describe_source(scenario), **values, "versions": provenance.versions(*packages), "files": {}}
+    return documents.stamp(kind, content)
 
 
 def escape_unencodable_output() -> None:

@@ -244,7 +244,7 @@ def _result(
         "evaluations": fit.evaluations,
         "parameters": {path: np.asarray(v, float).tolist() for path, _, v in parameters(fit.part)},
     }
-    return console.document(scenario, values, "optax", "scipy")
+    return console.document("identify", scenario, values, "optax", "scipy")
 
 
 def _scalar_values(

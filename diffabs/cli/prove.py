@@ -333,8 +333,7 @@ def _document(
         reason = reason if len(proof.undecided) else proof.failure
     else:
         reason = ""
-    return {
-        **console.describe_source(scenario),
+    values = {
         "verdict": proof.verdict,
         "reason": reason,
         "over": {path: list(ends) for path, ends in box.items()},
@@ -346,5 +345,5 @@ def _document(
         "share_left": float(shares.sum()),
         "tried": proof.tried,
         "seconds": proof.seconds,
-        "versions": provenance.versions("numpy"),
     }
+    return console.document("prove", scenario, values, "numpy")

@@ -14,7 +14,6 @@ from diffabs.cli import engine as engines
 from diffabs.config.values import ScenarioError, read_number, unknown_name_error
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject
-from diffabs.runtime import provenance
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
@@ -117,8 +116,7 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
 def _document(event: "RareEvent", study: "Study", scenario: Scenario, metric: str, bound: float) -> JsonObject:
     """Return the JSON document; its failures are values by path in SI, the likeliest first."""
     rows = study.space.normal(event.failing[:MAX_SHOWN_FAILURES]) if len(event.failing) else {}
-    return {
-        **console.describe_source(scenario),
+    values = {
         "metric": metric,
         "bound": bound,
         "unit": unit_of(scenario.objectives[metric], scenario.loop.plant),
@@ -137,5 +135,5 @@ def _document(event: "RareEvent", study: "Study", scenario: Scenario, metric: st
         "diverged": event.diverged,
         "seed": study.seed,
         "engine": dict(event.engine),
-        "versions": provenance.versions("numpy", "scipy"),
     }
+    return console.document("rare", scenario, values, "numpy", "scipy")

@@ -1,7 +1,6 @@
 """Output of the commands: tables for a person, JSON and CSV for a script."""
 
 import csv
-import json
 import math
 import pathlib
 from collections.abc import Iterator, Mapping
@@ -18,6 +17,7 @@ from diffabs.core.bijectors import reached_bound
 from diffabs.core.summary import format_metric, round_for_table
 from diffabs.core.types import JsonObject, Params, Part
 from diffabs.papers.digest import Digest
+from diffabs.runtime import documents
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.convert import trajectory_columns
@@ -37,16 +37,7 @@ COSTS = {
 
 def as_json(value: object) -> None:
     """Print one JSON document to stdout; a number without a form in JSON becomes null."""
-    typer.echo(json.dumps(replace_infinite(value), indent=2, allow_nan=False))
-
-
-def replace_infinite(value: object) -> object:
-    """Return values with null in place of NaN and infinity, which JSON lacks."""
-    if isinstance(value, dict):
-        return {str(key): replace_infinite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [replace_infinite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    typer.echo(documents.format_document(value))
 
 
 def write_csv(run: Run, plant: Part, path: pathlib.Path) -> None:

@@ -6,7 +6,6 @@ runs.
 
 import contextlib
 import dataclasses
-import json
 import os
 import pathlib
 import sys
@@ -22,7 +21,7 @@ from diffabs.cli import console, progress, report, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.core.types import JsonObject, PyTree
-from diffabs.runtime import files
+from diffabs.runtime import documents, files
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import Scenario, dump, loads
 from diffabs.simulate.admissible import first_refusal
@@ -268,7 +267,8 @@ def _result(results: "Results", study: "Study", out: pathlib.Path, check: int) -
         halved = beside.submit(check_accuracy, study, results, check) if check else None
         summary = summarise_sweep(results)
     accuracy = halved.result() if halved else None
-    result = {"out": str(out), **summary, "accuracy": accuracy, "made": console.describe_run(), "files": {}}
+    values = {"out": str(out), **summary, "accuracy": accuracy, "made": console.describe_run(), "files": {}}
+    result = documents.stamp("sweep", values)
     _write_summary(out, result)
     return result
 
@@ -296,5 +296,4 @@ def _write_files(
 
 def _write_summary(out: pathlib.Path, result: JsonObject) -> None:
     # The sweep's lock is released by now: another --resume of a complete sweep may write the same file.
-    document = json.dumps(show.replace_infinite(result), indent=1, allow_nan=False)
-    files.write_synced(out / SUMMARY, document.encode())
+    files.write_synced(out / SUMMARY, documents.format_document(result, 1).encode())

@@ -106,7 +106,7 @@ def _tune_and_document(work: Work, engine: str) -> tuple["Tuned", JsonObject, st
 
 def _document(work: Work, tuned: "Tuned", proved: Proved) -> JsonObject:
     packages = ("optax", "scipy", *(("cvxpy", "clarabel") if proved.certified else ()))
-    return console.document(work.scenario, describe_tuning(work, tuned, proved), *packages)
+    return console.document("tune", work.scenario, describe_tuning(work, tuned, proved), *packages)
 
 
 def _draw_unless_interrupted(work: Work, tuned: "Tuned", picture: pathlib.Path, interrupted: bool) -> JsonObject:

@@ -1,19 +1,16 @@
 """The JSON documents of the commands, recognised by their keys."""
 
 import errno
-import json
 import os
 import pathlib
-import sys
 from collections.abc import Iterator
 from typing import NamedTuple
 
 from diffabs.config.values import format_given
 from diffabs.core.types import JsonObject
 from diffabs.papers import PAPERS
-from diffabs.runtime import files
+from diffabs.runtime.documents import DocumentError, kind_of, read_document
 
-MAX_DOCUMENT_BYTES = 2**27  # bytes of a document
 SUMMARY, MANIFEST = "summary.json", "manifest.json"
 KEYS_BY_KIND = {  # the keys that only this kind has
     "reproduce": ("paper", "rows", "figures"),
@@ -88,10 +85,10 @@ def _sort_key(path: pathlib.Path) -> tuple[int, str]:
 def _documents_of_file(path: pathlib.Path, named: bool = False) -> Iterator[Document]:
     """Yield the documents of a file. Raises ReportError for a `named` file without a document."""
     try:
-        content = json.loads(files.read_content(path, MAX_DOCUMENT_BYTES), parse_int=_read_integer)
-    except OverflowError as error:
+        content = read_document(path)
+    except DocumentError as error:
         raise ReportError(f"{path}: {error}") from None
-    except (ValueError, RecursionError):
+    except ValueError:
         if named:
             raise ReportError(f"{path}: is not a JSON document that {READABLE_DOCUMENTS}") from None
         return
@@ -99,14 +96,6 @@ def _documents_of_file(path: pathlib.Path, named: bool = False) -> Iterator[Docu
     if named and not documents:
         raise ReportError(f"{path}: is not a document that {READABLE_DOCUMENTS}")
     yield from documents
-
-
-def _read_integer(text: str) -> int:
-    """Return a whole number of JSON. Raises OverflowError for a number beyond the range of a float."""
-    value = int(text)
-    if abs(value) > sys.float_info.max:
-        raise OverflowError(f"a whole number of {len(text.lstrip('-'))} digits is too large")
-    return value
 
 
 def _inside(content: object, path: pathlib.Path) -> Iterator[Document]:
@@ -124,7 +113,8 @@ def _inside(content: object, path: pathlib.Path) -> Iterator[Document]:
                 )
         return
     for kind, keys in KEYS_BY_KIND.items():
-        if all(key in content for key in keys) and content.get("format", CERTIFICATE_FORMAT) == CERTIFICATE_FORMAT:
+        is_stated = content.get("format", CERTIFICATE_FORMAT) == CERTIFICATE_FORMAT or kind_of(content) == kind
+        if is_stated and all(key in content for key in keys):
             # The output of `sweep --json` counts as the summary in the sweep's folder: figures and manifest are there.
             if kind == "sweep" and not (path.parent / MANIFEST).exists() and isinstance(content.get("out"), str):
                 if (folder := _find_folder(pathlib.PurePath(content["out"]), path)) is None:

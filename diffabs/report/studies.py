@@ -1,12 +1,11 @@
 """Sweeps and rare events as sections of a report."""
 
-import json
 import pathlib
 import shlex
 from collections.abc import Iterator, Mapping
 
 from diffabs.core.types import JsonObject, Table
-from diffabs.report.documents import MANIFEST, MAX_DOCUMENT_BYTES, Document
+from diffabs.report.documents import MANIFEST, Document
 from diffabs.report.page import (
     Figure,
     ReportTable,
@@ -20,7 +19,7 @@ from diffabs.report.page import (
     model_tables,
     table_unit,
 )
-from diffabs.runtime import files
+from diffabs.runtime.documents import read_document
 from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import ScenarioError, loads
 from diffabs.sweep.checking import describe_turned_metrics
@@ -40,7 +39,7 @@ INTERVAL = ("value", "low", "high")
 def sweep_section(document: Document) -> Section:
     """Return the section of a sweep."""
     content = document.content
-    manifest = json.loads(files.read_content(document.folder / MANIFEST, MAX_DOCUMENT_BYTES))
+    manifest = read_document(document.folder / MANIFEST)
     study, source, units = manifest["study"], manifest["source"], manifest.get("units") or {}
     commit = {"commit": manifest["commit"]} if manifest.get("commit") else {}
     origin = content.get("made", {})  # a summary of `summarise_sweep` has none

@@ -54,7 +54,7 @@ def build_report(documents: Sequence[Document], title: str = "") -> str:
 def _section(document: Document) -> Section:
     try:
         return SECTION_BY_KIND[document.kind](document)
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OSError, RecursionError) as error:
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OSError) as error:
         message = " ".join(f"{type(error).__name__} {error}".split())
         raise ReportError(f"{document.path}: cannot be read as a document of {document.kind}: {message}") from None
 

@@ -36,7 +36,7 @@ from diffabs.config.values import (
 )
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject, PyTree, Table
-from diffabs.runtime import files, provenance
+from diffabs.runtime import documents, files, provenance
 from diffabs.sweep import variables
 from diffabs.sweep.seal import Seal, SweepError, json_digest
 from diffabs.sweep.study import DTYPES, FLAG_COLUMNS, RANGES, Study
@@ -106,9 +106,9 @@ def read_manifest(folder: pathlib.Path) -> JsonObject:
         why = getattr(error, "strerror", None) or error
         raise SweepError(f"{folder} is no sweep: {MANIFEST_NAME}: {why}") from None
     try:
-        return _check_manifest(json.loads(raw))
-    except (ValueError, RecursionError) as error:
-        why = "nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())
+        return _check_manifest(documents.parse_document(raw))
+    except ValueError as error:
+        why = " ".join(str(error).split())
         raise SweepError(f"{folder} is no sweep that can be read: {MANIFEST_NAME}: {why}") from None
 
 

@@ -26,6 +26,7 @@ from diffabs.scenario.scenario import load
 CHECKER = ROOT / "tests" / "support" / "check_certificate.py"
 KEYS = [
     *(
+        "format",
         "scenario",
         "model",
         "made",

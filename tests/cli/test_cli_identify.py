@@ -22,6 +22,7 @@ from diffabs.tune import Reason
 
 KEYS = [
     *(
+        "format",
         "scenario",
         "model",
         "made",

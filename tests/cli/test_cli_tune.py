@@ -33,7 +33,7 @@ from diffabs.simulate.run import measure
 from diffabs.tune import DerivativeMode, Reason, StartError, Tuned
 
 KEYS = [
-    *("scenario", "model", "made", "lanes", "free", "objective", "metrics", "constraints", "met", "reason"),
+    *("format", "scenario", "model", "made", "lanes", "free", "objective", "metrics", "constraints", "met", "reason"),
     "gradient_norm",
     *("evaluations", "mode", "engine", "history", "starts", "parameters", "certificate", "versions", "files"),
     "interrupted",

@@ -1,6 +1,5 @@
 """The file of a certificate: JSON that round-trips exactly, with a check of every field on reading."""
 
-import json
 import math
 import os
 from collections.abc import Iterable
@@ -9,7 +8,7 @@ import numpy as np
 
 from diffabs.core.types import Params, PyTree
 from diffabs.design.polytopes import Polytope, Schedule
-from diffabs.runtime import files
+from diffabs.runtime import documents, files
 
 CERTIFICATE_FORMAT, CERTIFICATE_VERSION = "diffabs certificate", 1
 # As in `design.verify`, so that both read what is written.
@@ -24,14 +23,6 @@ def describe_system(system: Polytope | Schedule) -> dict[str, PyTree]:
     corners = [{name: float(value) for name, value in corner.items()} for corner in system.corners]
     names = {"period": system.period, "states": list(system.states), "corners": corners}
     return {"A": system.A.tolist(), "B": system.B.tolist(), **names}
-
-
-def reject_duplicate_names(pairs: list[tuple[str, PyTree]]) -> dict[str, PyTree]:
-    """Return a JSON object from its members; two readers may take different values of a name that occurs twice."""
-    members = dict(pairs)
-    if len(members) != len(pairs):
-        raise ValueError(f"a name comes twice among {', '.join(name for name, _ in pairs)}")
-    return members
 
 
 def read_members(value: object, where: str, *names: str) -> list[PyTree]:
@@ -72,7 +63,7 @@ def format_certificate(system: Polytope | Schedule, gain: np.ndarray, claims: It
         "gain": gain.tolist(),
         "claims": [{"kind": kind, "data": {k: v.tolist() for k, v in data.items()}} for kind, data in arrays],
     }
-    content = json.dumps(data, allow_nan=False, indent=1) + "\n"
+    content = documents.format_document(data, 1) + "\n"
     if len(content) > MAX_CERTIFICATE_BYTES:
         raise ValueError(f"the certificate is larger than {MAX_CERTIFICATE_BYTES} bytes: fewer vertices are needed")
     return content
@@ -85,11 +76,7 @@ def read_certificate(
     raw = files.read_content(path, MAX_CERTIFICATE_BYTES + 1)
     if len(raw) > MAX_CERTIFICATE_BYTES:
         raise ValueError(f"the file is larger than {MAX_CERTIFICATE_BYTES} bytes")
-    content = raw.decode()
-    return certificate_from_json(
-        # Integers become floats, as in the arrays of the certificate; NaN and Infinity are rejected.
-        json.loads(content, parse_int=float, parse_constant=read_numbers, object_pairs_hook=reject_duplicate_names)
-    )
+    return certificate_from_json(documents.parse_document(raw.decode(), exact=True))
 
 
 def certificate_from_json(value: object) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, PyTree]]]]:
