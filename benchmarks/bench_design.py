@@ -24,10 +24,10 @@ import record
 from rich.console import Console
 from rich.table import Table
 
-from diffabs.design import Polytope, Spec, certify, design
-from diffabs.design.sdp import solver
-from diffabs.design.sdp.program import DesignProgram
-from diffabs.design.sdp.scaling import design_frames
+from diffabs.robust.design import Polytope, Spec, certify, design
+from diffabs.robust.design.sdp import solver
+from diffabs.robust.design.sdp.program import DesignProgram
+from diffabs.robust.design.sdp.scaling import design_frames
 
 BETA, ALPHAS, SPEEDS = 133.472842636189, (83.8796606703, 84.6321445666), (140.291806958, 14.0291806958)
 PAIRS = [(alpha, speed) for alpha in ALPHAS for speed in SPEEDS]

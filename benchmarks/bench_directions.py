@@ -22,8 +22,8 @@ from rich.table import Table
 
 import diffabs as d
 from diffabs import objectives, plants, roads, stops
+from diffabs.engine.drive import deferred
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.drive import deferred
 
 SOLVER = d.FixedStep(1e-3, 1.0)
 MEASURED = {"distance": objectives.StopDistance()}

@@ -41,7 +41,7 @@ from diffabs.compiler.ir import UpdateLevel, is_real, live_nodes
 from diffabs.compiler.program import ScalarProgram
 from diffabs.compiler.runtime import gpu, nvrtc
 from diffabs.core.pytree import get
-from diffabs.simulate.drive import kernel as native
+from diffabs.engine.drive import kernel as native
 
 ACCURACY = 1e-4
 STEPS, TOLERANCES, TOLERANCES_OF_DIFFRAX = (1e-3, 5e-4, 2e-4, 1e-4), (1e-5, 5e-6, 1e-6), (1e-6, 1e-7, 1e-8, 3e-9)

@@ -27,10 +27,10 @@ from rich.console import Console
 from rich.table import Table
 
 from diffabs import FixedStep
-from diffabs.design.attraction import Cells, region_of_attraction
-from diffabs.reliability.failure import failure_probability
+from diffabs.robust.design.attraction import Cells, region_of_attraction
 from diffabs.scenario import load, section_sweep
 from diffabs.tune.worst import worst_case
+from diffabs.uncertainty.reliability.failure import failure_probability
 
 ENGINES = ("xla", "kernel")
 W4 = 'sweep.over.road.w4={type="normal",mean=0.4,deviation=0.01,low=0.3}'

@@ -35,14 +35,14 @@ CHANGES = ("solver.step=1e-3", "solver.duration=4.0", "sensor=noise", "sensor.sl
 
 def child(options):
     """One case, in this process: prints a line of JSON."""
-    from diffabs.sweep import Local, sweep
+    from diffabs.uncertainty.sweep import Local, sweep
 
     count = int(options.case.split()[0])
     if "device" in options.case:
         jax.config.update("jax_num_cpu_devices", count)
         engine = Local(jax.devices())  # one chunk for each device
     else:
-        from diffabs.sweep.cluster import Dask
+        from diffabs.uncertainty.sweep.cluster import Dask
 
         engine = Dask(workers=count)
     sizes = (f"sweep.samples={options.samples}", f"sweep.chunk={options.chunk}", f'sweep.dtype="{options.dtype}"')

@@ -11,8 +11,8 @@ from peers import ours
 
 import diffabs
 from diffabs import objectives, references, sensors
+from diffabs.parts.sensors import noise
 from diffabs.scenario.scenario import load
-from diffabs.sensors import noise
 
 TOLERANCES = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 3e-7, 1e-7)
 BRAKING = ours.MEASURED
@@ -41,7 +41,7 @@ class Problem:
         distinct ones are spread over them, more go through them again and again."""
         which = np.arange(count) % distinct if count > distinct else (np.arange(count) + 0.5) * distinct // count
         which = which.astype(int)
-        values = diffabs.simulate.batch.latin(self.box, distinct).values
+        values = diffabs.loop.batch.latin(self.box, distinct).values
         keys = np.arange(distinct)[which] if self.noisy else None
         return diffabs.Batch({path: np.asarray(x)[which] for path, x in values.items()}, keys), which
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from diffabs.runtime import provenance
+from diffabs.host import provenance
 
 OUT = pathlib.Path("out/benchmarks")
 

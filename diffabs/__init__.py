@@ -2,36 +2,56 @@
 
 from typing import TYPE_CHECKING
 
-from diffabs.runtime import interrupt as _interrupt
+from diffabs.host import interrupt as _interrupt
 
 _interrupt.end_early_on_interrupt()  # before JAX, whose import takes seconds
 
 from diffabs.core.loop import Loop as Loop
 from diffabs.core.pytree import arrays as arrays
 from diffabs.core.pytree import replace as replace
-from diffabs.plants import BrakeStart as BrakeStart
-from diffabs.runtime.exports import lazy_getattr as _lazy_getattr
+from diffabs.engine.admissible import check as check
+from diffabs.engine.run import measure as measure
+from diffabs.engine.run import rollout as rollout
+from diffabs.engine.solve import Event as Event
+from diffabs.engine.solve import Solution as Solution
+from diffabs.engine.solve import solve as solve
+from diffabs.engine.solve import switches as switches
+from diffabs.engine.types import Adaptive as Adaptive
+from diffabs.engine.types import FixedStep as FixedStep
+from diffabs.engine.types import Run as Run
+from diffabs.host.exports import lazy_getattr as _lazy_getattr
+from diffabs.loop.batch import Batch as Batch
+from diffabs.loop.ensemble import run_batch as run_batch
+from diffabs.parts.plants import BrakeStart as BrakeStart
 from diffabs.scenario.defaults import balancing as balancing
 from diffabs.scenario.defaults import braking as braking
-from diffabs.simulate.admissible import check as check
-from diffabs.simulate.batch import Batch as Batch
-from diffabs.simulate.ensemble import run_batch as run_batch
-from diffabs.simulate.run import measure as measure
-from diffabs.simulate.run import rollout as rollout
-from diffabs.simulate.solve import Event as Event
-from diffabs.simulate.solve import Solution as Solution
-from diffabs.simulate.solve import solve as solve
-from diffabs.simulate.solve import switches as switches
-from diffabs.simulate.types import Adaptive as Adaptive
-from diffabs.simulate.types import FixedStep as FixedStep
-from diffabs.simulate.types import Run as Run
 
 if TYPE_CHECKING:
     from diffabs import linear as linear
-    from diffabs import sweep as sweep
     from diffabs import tune as tune
+    from diffabs.parts import actuators as actuators
+    from diffabs.parts import controllers as controllers
+    from diffabs.parts import objectives as objectives
+    from diffabs.parts import plants as plants
+    from diffabs.parts import references as references
+    from diffabs.parts import roads as roads
+    from diffabs.parts import sensors as sensors
+    from diffabs.parts import stops as stops
+    from diffabs.robust import design as design
+    from diffabs.robust import reach as reach
     from diffabs.scenario.registry import register_parts as register_parts
     from diffabs.scenario.scenario import load as load
+    from diffabs.uncertainty import sweep as sweep
 
-__getattr__ = _lazy_getattr(__name__)
+_export = _lazy_getattr(__name__)
+
+
+def __getattr__(name: str) -> object:
+    if name == "simulate":
+        raise AttributeError(
+            "diffabs has no simulate: a run is d.rollout(loop, solver), its metrics d.measure(loop, solver, objectives)"
+        )
+    return _export(name)
+
+
 __version__ = "0.1.0"

@@ -141,7 +141,7 @@ def file(tmp_path: pathlib.Path):
 def native_prover() -> None:
     """The native prover; a machine without a compiler skips the test."""
     from diffabs.compiler.runtime.toolchain import NoCompiler
-    from diffabs.reach import engine
+    from diffabs.robust.reach import engine
 
     try:
         engine.library()

@@ -20,7 +20,7 @@ from diffabs.core import protocols
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, Tracking
 from diffabs.core.pytree import canonical_dtypes, get, parameters, replace
 from diffabs.core.validity import check_part
-from diffabs.plants import BrakeStart
+from diffabs.parts.plants import BrakeStart
 
 EVERY = [pytest.param(family, part, id=f"{family}: {name}") for family in PARTS for name, part in PARTS[family].items()]
 # of the families that have no Protocol
@@ -39,9 +39,9 @@ def signatures(family):
 
 
 @killed_by(
-    "roads/__init__.py",
-    "from diffabs.roads.tabulated import Tabulated as Tabulated\n",
-    "from diffabs.roads.tabulated import PiecewiseCubic as PiecewiseCubic, Tabulated as Tabulated\n",
+    "parts.roads.__init__",
+    "from diffabs.parts.roads.tabulated import Tabulated as Tabulated\n",
+    "from diffabs.parts.roads.tabulated import PiecewiseCubic as PiecewiseCubic, Tabulated as Tabulated\n",
 )
 def test_every_exported_part_has_an_instance():
     """The list above the tests is the test's reach: a part missing from it would be tested by nothing."""
@@ -109,7 +109,7 @@ def test_replace_changes_one_parameter(family, part):
 
 
 @killed_by(
-    "core/pytree.py",
+    "core.pytree",
     "return structure.unflatten([as_array(x, dtype) for x in leaves])",
     "return tree",
     case="plant: quarter car",
@@ -139,8 +139,8 @@ def road_slopes(road, slip, speed, distance):
     return jax.vmap(mu, (None, 0, 0, 0))(road, slip, speed, distance)
 
 
-@killed_by("core/numerics.py", "return s * curve(s * x)", "return curve(s * x)", case="SNOW")
-@killed_by("core/numerics.py", "jnp.log(jnp.where(nonzero, square, 1.0))", "jnp.log(square)", case="RIG")
+@killed_by("core.numerics", "return s * curve(s * x)", "return curve(s * x)", case="SNOW")
+@killed_by("core.numerics", "jnp.log(jnp.where(nonzero, square, 1.0))", "jnp.log(square)", case="RIG")
 @pytest.mark.parametrize("name", ROADS)
 def test_road(name):
     """mu(0) = 0, odd, bounded, C1 at 0, and finite with its derivatives where curves are in danger of not being."""
@@ -206,7 +206,7 @@ def test_plant_keeps_the_structure_of_its_state(name, dtype):
 
 
 @killed_by(
-    "plants/mirrored_rig.py",
+    "parts.plants.mirrored_rig",
     "wheel = quotient(push * self.wheel_radius - control, self.wheel_inertia)",
     'wheel = (__import__("jax").lax.stop_gradient(push) * self.wheel_radius - control) / self.wheel_inertia',
     case="mirrored rig",
@@ -335,7 +335,7 @@ def test_objective_gradient(name):
     np.testing.assert_allclose(exact, differenced, rtol=1e-5, atol=1e-8)
 
 
-@killed_by("objectives/tracking.py", "jnp.abs(whole))", "whole)", case="iae")
+@killed_by("parts.objectives.tracking", "jnp.abs(whole))", "whole)", case="iae")
 @pytest.mark.parametrize("name", ["iae", "itae", "final_slip_error", "settling_time", "quadratic"])
 def test_errors_count_on_either_side(name):
     found = jax.jit(partial(parts.objective_run, sample_at=parts.mirrored_at))(

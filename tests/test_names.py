@@ -15,7 +15,7 @@ TREES = {path.relative_to(PACKAGE): ast.parse(path.read_text("utf-8")) for path 
 # The same verb, the same meaning: a command and the function that it calls; the methods of a paper's module; a
 # formula of a checker that imports nothing of the package.
 SHARED_FUNCTIONS = {
-    *("certify", "design", "identify", "margins", "simulate", "sweep", "tune"),
+    *("certify", "design", "identify", "margins", "sweep", "tune"),
     *("compact", "figures", "loop", "reproduce", "run", "table"),
     *("he", "is_positive_definite"),
 }
@@ -82,13 +82,13 @@ def test_two_homes_are_found():
     assert several(homes(ast.FunctionDef, trees)) == {"find": ["a.py", "b.py"]}
 
 
-@killed_by("design/parameter_box.py", "MIN_ENTRY_EXTENT", "CORRELATION_TOLERANCE")
+@killed_by("robust.design.parameter_box", "MIN_ENTRY_EXTENT", "CORRELATION_TOLERANCE")
 def test_a_constant_has_one_meaning():
     several_values = {name: files for name, files in constants().items() if len(set(files.values())) > 1}
     assert {name: files for name, files in several_values.items() if name not in SHARED_CONSTANTS} == {}
 
 
-@killed_by("stops/stops.py", "_rest_of_braking", "_braked")
+@killed_by("parts.stops.stops", "_rest_of_braking", "_braked")
 @pytest.mark.parametrize("path", TREES, ids=str)
 def test_no_function_is_named_by_a_participle(path):
     names = {node.name.strip("_") for node in functions(TREES[path])}
@@ -106,7 +106,7 @@ def things(tree):
                 yield name, node.lineno
 
 
-@killed_by("simulate/types.py", "    comparison: Int", "    which: Int")
+@killed_by("engine.types", "    comparison: Int", "    which: Int")
 @pytest.mark.parametrize("path", TREES, ids=str)
 def test_a_thing_has_the_name_of_a_thing(path):
     assert [f"{name}, line {line}" for name, line in things(TREES[path]) if name.strip("_") in FILLERS] == []

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from diffabs.cli import console, show, targets
-from diffabs.config import values
 from diffabs.core.types import JsonObject
+from diffabs.host import values
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import dump, names, read_header
 

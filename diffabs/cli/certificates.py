@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from diffabs.cli import console
-from diffabs.config.values import ScenarioError, format_given
 from diffabs.core.types import JsonObject
-from diffabs.runtime.separated import read_decimal
+from diffabs.host.separated import read_decimal
+from diffabs.host.values import ScenarioError, format_given
 from diffabs.scenario import proving
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
-    from diffabs.design import Certificate
-    from diffabs.design.loop_task import ProofTask
+    from diffabs.robust.design import Certificate
+    from diffabs.robust.design.loop_task import ProofTask
 
 
 def build_proof_task(scenario: Scenario, gain: str | None = None, *, weighed: bool = False) -> "ProofTask":
@@ -60,7 +60,7 @@ def proof_document(
 
 @contextlib.contextmanager
 def report_design_errors() -> Iterator[None]:
-    """Turn errors of `diffabs.design` into one line."""
+    """Turn errors of `diffabs.robust.design` into one line."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -8,11 +8,11 @@ import typer
 
 from diffabs.cli import console, show, show_samples
 from diffabs.cli.show_samples import warn_of_strays
-from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.core.types import JsonObject
+from diffabs.host.values import ScenarioError, unknown_name_error
 
 if TYPE_CHECKING:
-    from diffabs.sweep import Results
+    from diffabs.uncertainty.sweep import Results
 
 FEWEST = 4  # common samples below which a metric has no statistics
 STATISTICS = (
@@ -33,8 +33,8 @@ def compare(
     The samples are the same, so differences of the second from the first have narrow intervals."""
     with console.end_on_errors():
         console.need_extra("sweep")
-        from diffabs.sweep import Results
-        from diffabs.sweep.store import describe_differences
+        from diffabs.uncertainty.sweep import Results
+        from diffabs.uncertainty.sweep.store import describe_differences
 
         a, b = Results(first), Results(second)
         for results in (a, b):
@@ -59,8 +59,8 @@ def _compare_metrics(a: "Results", b: "Results", metrics: list[str]) -> JsonObje
     Samples that diverged or were refused in either sweep are left out. A sample with an infinite metric in either sweep
     is left out of that metric, and counted. With fewer than `FEWEST` samples the statistics are None.
     """
-    from diffabs.sweep.statistics.estimates import Moments
-    from diffabs.sweep.statistics.paired import compare_pairs
+    from diffabs.uncertainty.sweep.statistics.estimates import Moments
+    from diffabs.uncertainty.sweep.statistics.paired import compare_pairs
 
     lost = a.column("diverged") | b.column("diverged") | ~a.accepted | ~b.accepted
     rows = {}

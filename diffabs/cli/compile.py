@@ -15,13 +15,13 @@ from diffabs.compiler.lower.rules import Unsupported
 from diffabs.compiler.passes import PASSES, LaneCall, find_lane_calls, list_pass
 from diffabs.compiler.runtime.jax_primitive import MAX_TANGENTS_PER_LAUNCH
 from diffabs.compiler.runtime.toolchain import NoCompiler
-from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import Array, JsonObject
+from diffabs.engine.drive.engine import EngineError
+from diffabs.host.values import ScenarioError, unknown_name_error
+from diffabs.loop.batch import Batch
+from diffabs.loop.ensemble import run_batch
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.batch import Batch
-from diffabs.simulate.drive.engine import EngineError
-from diffabs.simulate.ensemble import run_batch
 
 
 def compile_scenario(

@@ -18,15 +18,15 @@ import typer
 from rich.console import Console
 
 from diffabs.cli import progress
-from diffabs.config.values import ScenarioError
 from diffabs.core.types import JsonObject
-from diffabs.roads.sign import find_wrong_sign
-from diffabs.runtime import documents, files, interrupt, provenance, stopwatch
+from diffabs.engine.drive.engine import EngineError
+from diffabs.host import documents, files, interrupt, provenance, stopwatch
+from diffabs.host.values import ScenarioError
+from diffabs.parts.roads.sign import find_wrong_sign
 from diffabs.scenario import outside
 from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import Scenario, dump, load, names
 from diffabs.scenario.toml import parse_toml
-from diffabs.simulate.drive.engine import EngineError
 
 T = TypeVar("T")
 

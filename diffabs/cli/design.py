@@ -14,12 +14,12 @@ import typer
 from diffabs.cli import certificates, console, prove, show, targets
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
-from diffabs.runtime import provenance
+from diffabs.host import provenance
 from diffabs.scenario import proving
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
-    from diffabs.design.loop_task import ProofTask
+    from diffabs.robust.design.loop_task import ProofTask
 
 CHECK = "check it with: diffabs verify"
 
@@ -39,7 +39,7 @@ def design(
     with console.end_on_errors(), certificates.report_design_errors():
         with targets.new_target_file(out, "--out") as file:
             setup, task = _prepare(scenario, changes or (), weighed=True)
-            from diffabs.design import synthesis
+            from diffabs.robust.design import synthesis
 
             try:
                 solution = console.run_with_progress(
@@ -70,7 +70,7 @@ def certify(
     """Prove that a gain is stable over the ranges of [design.over].
 
     The result, proved or disproved, holds for parameters that vary arbitrarily fast."""
-    from diffabs.design import findings
+    from diffabs.robust.design import findings
 
     with console.end_on_errors(), certificates.report_design_errors():
         with targets.new_target_file(out, "--out") as file:
@@ -106,7 +106,7 @@ def verify(
 
     The code is independent of the code that made the certificate.
     Exit status: 0 proved, or not refuted where --share leaves cells unchecked; 1 not proved, 2 no certificate."""
-    from diffabs.design.verify import verify_file as verified
+    from diffabs.robust.design.verify import verify_file as verified
 
     with console.end_on_errors():
         if not 0 < seconds < math.inf:
@@ -145,7 +145,7 @@ def _show(result: JsonObject, task: "ProofTask", as_json: bool) -> None:
     if as_json:
         show.as_json(result)
     else:
-        from diffabs.design.findings import VERDICT_WORDS
+        from diffabs.robust.design.findings import VERDICT_WORDS
 
         units = {path: spec.unit for path, spec, _ in parameters(task.model)}
         verdict = VERDICT_WORDS[result["quadratically_stable"]]

@@ -6,9 +6,9 @@ from typing import Annotated
 import typer
 
 from diffabs.cli import console
-from diffabs.config.values import ScenarioError, unknown_name_error
-from diffabs.simulate.drive.engine import REQUESTABLE_ENGINES, resolve_request
-from diffabs.simulate.drive.sharding import describe_placement
+from diffabs.engine.drive.engine import REQUESTABLE_ENGINES, resolve_request
+from diffabs.engine.drive.sharding import describe_placement
+from diffabs.host.values import ScenarioError, unknown_name_error
 
 Engine = Annotated[
     str,

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from diffabs.cli import console, prove
-from diffabs.config.values import ScenarioError
-from diffabs.runtime import interrupt
+from diffabs.host import interrupt
+from diffabs.host.values import ScenarioError
 from diffabs.scenario.proving import certify_result
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.tuning import build_work
 
 if TYPE_CHECKING:
-    from diffabs.explore.session import ProofVerdict, Session
-    from diffabs.explore.tuning import TuningTask
+    from diffabs.output.explore.session import ProofVerdict, Session
+    from diffabs.output.explore.tuning import TuningTask
 
 PORT = 8342
 DEFAULT_SCENARIO = "slip-cured"  # shown without an argument
@@ -48,8 +48,8 @@ def explore(
         console.need_extra("explore")
         console.load_scenario(scenario, None)  # reports a wrong scenario here, before a page opens
         judge = load_judge(proof) if proof else None
-        from diffabs.explore import server
-        from diffabs.explore.session import Tools
+        from diffabs.output.explore import server
+        from diffabs.output.explore.session import Tools
 
         listener = _open_socket(port)
         options = {
@@ -69,7 +69,7 @@ def _open_socket(port: int | None) -> socket.socket:
 
     The socket listens before the server starts, so that a port in use is reported at once.
     """
-    from diffabs.explore.guard import LOOPBACK_ADDRESS
+    from diffabs.output.explore.guard import LOOPBACK_ADDRESS
 
     try:
         return socket.create_server((LOOPBACK_ADDRESS, PORT if port is None else port))
@@ -82,7 +82,7 @@ def _open_socket(port: int | None) -> socket.socket:
 
 def load_judge(path: pathlib.Path) -> "Callable[[Session], ProofVerdict]":
     """Return the function that judges a session by a proof's file."""
-    from diffabs.explore.proved import judge_values, load_proved_box
+    from diffabs.output.explore.proved import judge_values, load_proved_box
 
     document = prove.read_proof_file(path)
     if document is None:
@@ -99,7 +99,7 @@ def prove_scenario(scenario: Scenario) -> "ProofVerdict":
     The word is "certified", "refuted" or "undecided" for quadratic stability. Without any certificate it is "unknown",
     and the sentence gives the reason.
     """
-    from diffabs.explore.session import CERTIFIED, NOT_PROVED, REFUTED, UNDECIDED, ProofVerdict
+    from diffabs.output.explore.session import CERTIFIED, NOT_PROVED, REFUTED, UNDECIDED, ProofVerdict
 
     outcome = certify_result(scenario)
     sentence = outcome.sentence.partition(": ")[2]
@@ -111,7 +111,7 @@ def prove_scenario(scenario: Scenario) -> "ProofVerdict":
 
 def pose_tuning(scenario: Scenario) -> "TuningTask":
     """Return runs and constraints of a scenario's [tune]."""
-    from diffabs.explore.tuning import TuningTask
+    from diffabs.output.explore.tuning import TuningTask
 
     try:
         work = build_work(scenario)

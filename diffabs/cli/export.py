@@ -12,11 +12,11 @@ from rich.table import Table
 
 from diffabs import __version__
 from diffabs.cli import console, show, tables, targets
-from diffabs.config.values import ScenarioError
-from diffabs.controllers import Sampled, SampledOnGrid
-from diffabs.runtime.provenance import versions
+from diffabs.engine.types import FixedStep
+from diffabs.host.provenance import versions
+from diffabs.host.values import ScenarioError
+from diffabs.parts.controllers import Sampled, SampledOnGrid
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.types import FixedStep
 
 
 class Form(enum.StrEnum):
@@ -62,7 +62,7 @@ def export(
 
     The code has the controller's filter, limits, anti-windup, schedule and target."""
     with console.end_on_errors():
-        from diffabs.export import NotExported
+        from diffabs.output.export import NotExported
 
         if to is not Form.TABLE and as_json:
             console.fail("--json is for --to table; code is text")
@@ -100,7 +100,7 @@ def export(
 
 
 def _sample_controller(scenario: Scenario, period: float) -> Scenario:
-    from diffabs.export import sample_controller
+    from diffabs.output.export import sample_controller
 
     if isinstance(scenario.loop.controller, Sampled | SampledOnGrid):
         raise ScenarioError("--period: the scenario's controller is sampled; change it with --set controller.period=")
@@ -117,7 +117,7 @@ def _function_prefix(scenario: Scenario, out: pathlib.Path | None) -> str:
 
 
 def _write_source(scenario: Scenario, out: pathlib.Path | None, to: Form, single: bool, extra_input: object) -> str:
-    from diffabs.export import c_source, computer_program, structured_text
+    from diffabs.output.export import c_source, computer_program, structured_text
 
     step = getattr(scenario.solver, "step", None)
     dtype = np.float32 if single else np.float64
@@ -129,7 +129,7 @@ def _write_source(scenario: Scenario, out: pathlib.Path | None, to: Form, single
 
 def _write_fmu(scenario: Scenario, file: pathlib.Path, out: pathlib.Path) -> None:
     """Write the plant with the scenario's fixed steps. Raises ScenarioError, NotExported."""
-    from diffabs.export import build_fmu
+    from diffabs.output.export import build_fmu
 
     solver = scenario.solver
     if not isinstance(solver, FixedStep):
@@ -144,7 +144,7 @@ def _write_fmu(scenario: Scenario, file: pathlib.Path, out: pathlib.Path) -> Non
 
 
 def _show_table(scenario: Scenario, file: pathlib.Path | None, as_json: bool) -> None:
-    from diffabs.export import difference_equations
+    from diffabs.output.export import difference_equations
 
     equations = console.run_with_progress(lambda: difference_equations(scenario.loop), f"linearising {scenario.name}")
     states = [f"x{i + 1}" for i in range(len(equations["F"]))]

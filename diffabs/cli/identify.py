@@ -12,16 +12,16 @@ import numpy as np
 import typer
 
 from diffabs.cli import certificates, console, progress, show, targets
-from diffabs.config.values import ScenarioError, format_given, read_number_in_range, unknown_name_error
 from diffabs.core.pytree import ParameterSpec, get, parameters
 from diffabs.core.types import JsonObject
+from diffabs.host.values import ScenarioError, format_given, read_number_in_range, unknown_name_error
 from diffabs.scenario import section_tune, toml
 from diffabs.scenario.measurements import Readings, read_measurements
 from diffabs.scenario.parameter_paths import flatten_table
 from diffabs.scenario.scenario import Scenario, dump
 
 if TYPE_CHECKING:
-    from diffabs.identify.fit import Identified
+    from diffabs.tune.identify.fit import Identified
 
 HIGH_CORRELATION = 0.95
 DEPENDENT = {"slip", "speed", "wheel_speed"}
@@ -190,7 +190,7 @@ def _fit_with_progress(
     fixed_noise: Mapping[str, float],
 ) -> tuple["Identified", dict[str, float], bool]:
     """Return the fit, its standard deviations by column, and True if Ctrl-C ended it."""
-    from diffabs.identify.noise import identify_with_noise
+    from diffabs.tune.identify.noise import identify_with_noise
 
     far: list[str] = []
 
@@ -274,7 +274,7 @@ def _residuals(
     readings: Readings, fit: "Identified", noise: Mapping[str, float], units: Mapping[str, str]
 ) -> dict[str, JsonObject]:
     """Return statistics of simulated minus measured, by column."""
-    from diffabs.identify.noise import root_mean_square
+    from diffabs.tune.identify.noise import root_mean_square
 
     each = np.split(np.asarray(fit.residuals), len(readings.columns))
     return {

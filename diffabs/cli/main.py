@@ -40,20 +40,20 @@ from diffabs.cli import (
     tune,
     usage,
 )
-from diffabs.config.values import ScenarioError
 from diffabs.core import jax_flags
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Key
-from diffabs.objectives import at_limits
-from diffabs.runtime import compilation_cache, interrupt, provenance
+from diffabs.engine.faults import describe_faults
+from diffabs.engine.matlab import write_mat
+from diffabs.engine.run import measure, rollout
+from diffabs.engine.sliding import describe_slide
+from diffabs.engine.types import Adaptive, Run, describe_solver
+from diffabs.host import compilation_cache, interrupt, provenance
+from diffabs.host.values import ScenarioError
+from diffabs.loop.checking import check_run_accuracy, describe_check, describe_loose_metrics
+from diffabs.parts.objectives import at_limits
 from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.checking import check_run_accuracy, describe_check, describe_loose_metrics
-from diffabs.simulate.faults import describe_faults
-from diffabs.simulate.matlab import write_mat
-from diffabs.simulate.run import measure, rollout
-from diffabs.simulate.sliding import describe_slide
-from diffabs.simulate.types import Adaptive, Run, describe_solver
 
 if COLLECTS:
     gc.enable()
@@ -250,7 +250,7 @@ def _check_accuracy(scenario: Scenario, key: Key) -> JsonObject:
 
 
 def _draw(scenario: Scenario, run: Run, picture: pathlib.Path) -> None:
-    from diffabs.plot import draw_run
+    from diffabs.output.plot import draw_run
 
     unit = scenario.loop.plant.control_unit
     draw_run(run, title=scenario.title or scenario.name, unit=unit).savefig(picture)

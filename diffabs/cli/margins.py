@@ -10,11 +10,11 @@ import typer
 from rich.table import Table
 
 from diffabs.cli import console, show, tables, targets
-from diffabs.config.values import ScenarioError, format_given, read_number_in_range
 from diffabs.core.pytree import ParameterSpec, replace
 from diffabs.core.types import JsonObject
-from diffabs.runtime import provenance
-from diffabs.runtime.separated import read_decimal
+from diffabs.host import provenance
+from diffabs.host.separated import read_decimal
+from diffabs.host.values import ScenarioError, format_given, read_number_in_range
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
@@ -117,7 +117,7 @@ def _find_margins(
 
 
 def _draw(scenario: Scenario, nominal: "System", band: "Band | None", picture: pathlib.Path) -> None:
-    from diffabs.plot import frequency
+    from diffabs.output.plot import frequency
 
     loops = [system.loop for system in band.systems] if band else []
     title = f"{scenario.title or scenario.name}: the open loop"

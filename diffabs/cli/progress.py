@@ -16,7 +16,7 @@ from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.spinner import Spinner
 
-from diffabs.runtime import stopwatch
+from diffabs.host import stopwatch
 
 SILENCE_S = 2.0  # s without a sign of life
 REPEAT_S = 5.0  # s between lines of progress

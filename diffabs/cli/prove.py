@@ -12,19 +12,19 @@ import typer
 
 from diffabs.cli import console, show_proofs, targets
 from diffabs.cli import show as views
-from diffabs.config.values import ScenarioError, format_given, unknown_name_error
 from diffabs.core.types import JsonObject
-from diffabs.runtime import files, provenance
-from diffabs.runtime.process import core_count
-from diffabs.runtime.separated import read_decimal
+from diffabs.host import files, provenance
+from diffabs.host.process import core_count
+from diffabs.host.separated import read_decimal
+from diffabs.host.values import ScenarioError, format_given, unknown_name_error
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.scenario import Scenario, dump, loads
 
 if TYPE_CHECKING:
-    from diffabs.plot.proofs import ProofMap
-    from diffabs.reach import BoxProof, RunClaim
-    from diffabs.reach.equations import Equations
-    from diffabs.reach.extremes import ExtremeRuns
+    from diffabs.output.plot.proofs import ProofMap
+    from diffabs.robust.reach import BoxProof, RunClaim
+    from diffabs.robust.reach.equations import Equations
+    from diffabs.robust.reach.extremes import ExtremeRuns
 
 MOST_BYTES = 2**28  # of a file that is read; some million cells
 
@@ -60,9 +60,9 @@ def prove(
             console.fail(f"--budget = {budget:g} is outside (0, inf) s")
         targets.check_picture(plot)
         from diffabs.compiler.runtime.toolchain import NoCompiler
-        from diffabs.reach import NoRule, prove_box
-        from diffabs.reach.equations import derive_equations
-        from diffabs.reach.extremes import find_extreme_runs
+        from diffabs.robust.reach import NoRule, prove_box
+        from diffabs.robust.reach.equations import derive_equations
+        from diffabs.robust.reach.extremes import find_extreme_runs
 
         setup = console.load_scenario(scenario, changes or (), integrated=False)
         sides = _read_sides(over, setup)
@@ -95,13 +95,13 @@ def prove(
                 result = _document(proof, setup, box, claims, extremes.ranges)
                 show_result = functools.partial(_show, result, setup, as_json)
                 if file:
-                    from diffabs.reach.certificate import certificate_document
+                    from diffabs.robust.reach.certificate import certificate_document
 
                     with console.show_before_errors(show_result):
                         file.write_text(json.dumps(certificate_document(proof, dump(setup), box, claims)) + "\n")
             result["files"] = {"certificate": str(out)} if out else {}
             if picture:
-                from diffabs.plot.proofs import draw_proof
+                from diffabs.output.plot.proofs import draw_proof
 
                 with console.show_before_errors(show_result):
                     shown = _map_of_proof(proof, setup, sides, claims, extremes)
@@ -132,10 +132,10 @@ def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as
     `share` of its cells are checked, in (0, 1].
     """
     console.need_extra("proof")
-    from diffabs.reach import NoRule
-    from diffabs.reach.equations import derive_equations
-    from diffabs.reach.extremes import find_extreme_runs
-    from diffabs.reach.verification import read_proof, verify_box
+    from diffabs.robust.reach import NoRule
+    from diffabs.robust.reach.equations import derive_equations
+    from diffabs.robust.reach.extremes import find_extreme_runs
+    from diffabs.robust.reach.verification import read_proof, verify_box
 
     far = [""]
     try:
@@ -227,7 +227,7 @@ def _read_sides(options: Sequence[str], scenario: Scenario) -> list[_Side]:
 
 def _choose_axes(sides: Sequence[_Side]) -> list[int]:
     """Return the indices of the parameters with more than one value. Raises ScenarioError unless there are 1 or 2."""
-    from diffabs.reach.extremes import is_wide
+    from diffabs.robust.reach.extremes import is_wide
 
     wide = [i for i, side in enumerate(sides) if is_wide(side.ends)]
     if len(wide) not in (1, 2):
@@ -240,7 +240,7 @@ def _map_of_proof(
     extremes: "ExtremeRuns",
 ) -> "ProofMap":  # fmt: skip
     """Return the map of the first claim's quantity, else of the greatest slip, in the units of the given ranges."""
-    from diffabs.plot.proofs import ProofMap
+    from diffabs.output.plot.proofs import ProofMap
 
     axes = _choose_axes(sides)
     scales = np.array([sides[i].scale for i in axes])
@@ -275,7 +275,7 @@ def _map_of_proof(
 
 def _read_claim(text: str, scenario: Scenario, equations: "Equations") -> "RunClaim":
     """Return a claim about a signal, the stop time or the stop distance. Raises ScenarioError."""
-    from diffabs.reach import claims
+    from diffabs.robust.reach import claims
 
     name, equals, number = text.partition("=")
     names = claims.claimable_names(scenario.loop.plant.shows._fields)

@@ -11,17 +11,17 @@ import typer
 
 from diffabs.cli import console, progress, show, show_samples
 from diffabs.cli import engine as engines
-from diffabs.config.values import ScenarioError, read_number, unknown_name_error
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject
+from diffabs.host.values import ScenarioError, read_number, unknown_name_error
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.toml import parse_value
 
 if TYPE_CHECKING:
-    from diffabs.reliability.subset_simulation import RareEvent, SubsetProgress
-    from diffabs.sweep import Study
+    from diffabs.uncertainty.reliability.subset_simulation import RareEvent, SubsetProgress
+    from diffabs.uncertainty.sweep import Study
 
 MAX_SHOWN_FAILURES = 5
 
@@ -45,7 +45,7 @@ def rare(
     Parameters vary as [sweep.over] says. Probabilities below 1e-7 are feasible."""
     with console.end_on_errors():
         console.need_extra("sweep")
-        from diffabs.reliability.failure import find_metric_objection
+        from diffabs.uncertainty.reliability.failure import find_metric_objection
 
         setup = console.load_scenario(scenario, console.add_option_overrides(changes, "sweep", seed=seed))
         show_samples.say_unused_seed(setup)
@@ -81,8 +81,8 @@ def _read_failure(text: str, scenario: Scenario) -> tuple[str, float]:
 
 def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients: bool) -> "RareEvent":
     """Return the probability. Raises ScenarioError for a wrong task, typer.Exit if too many runs diverge."""
-    from diffabs.reliability.failure import failure_probability
-    from diffabs.reliability.importance_sampling import DivergenceError
+    from diffabs.uncertainty.reliability.failure import failure_probability
+    from diffabs.uncertainty.reliability.importance_sampling import DivergenceError
 
     levels: list[SubsetProgress] = []
 

@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from diffabs.cli import console, targets
-from diffabs.config.values import ScenarioError
-from diffabs.runtime import files
+from diffabs.host import files
+from diffabs.host.values import ScenarioError
 
 DEFAULT_NAME = "report.html"
 ENDINGS = (".html", ".htm")
@@ -43,8 +43,8 @@ def report(
 
 def write_report_file(sources: Sequence[pathlib.Path], target: pathlib.Path, title: str = "") -> None:
     """Write the report of all documents in folders or files. The file is written whole or not at all."""
-    from diffabs.report import ReportError, find_documents
-    from diffabs.report import build_report as made
+    from diffabs.output.report import ReportError, find_documents
+    from diffabs.output.report import build_report as made
 
     try:
         text = made([document for source in sources for document in find_documents(source)], title)
@@ -56,7 +56,7 @@ def write_report_file(sources: Sequence[pathlib.Path], target: pathlib.Path, tit
 
 def check_target(target: pathlib.Path) -> None:
     """Check that a report may be written to a file."""
-    from diffabs.report import is_report
+    from diffabs.output.report import is_report
 
     target = targets.resolve_path(target, "--out")
     if target.exists() and not (target.is_file() and is_report(target)):

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from diffabs.cli import console, progress, report, show, targets
-from diffabs.config import values
 from diffabs.core.types import JsonObject
-from diffabs.runtime import provenance
+from diffabs.host import provenance, values
 
 if TYPE_CHECKING:
     from diffabs.papers import Reproduction

@@ -16,12 +16,12 @@ from diffabs.cli.tables import open_console, show_titled_table
 from diffabs.core.bijectors import reached_bound
 from diffabs.core.summary import format_metric, round_for_table
 from diffabs.core.types import JsonObject, Params, Part
+from diffabs.engine.convert import trajectory_columns
+from diffabs.engine.types import Run
+from diffabs.host import documents
 from diffabs.papers.digest import Digest
-from diffabs.runtime import documents
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.convert import trajectory_columns
-from diffabs.simulate.types import Run
 
 PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
 COSTS = {

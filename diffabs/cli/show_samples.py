@@ -13,7 +13,7 @@ from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
-    from diffabs.sweep import Results
+    from diffabs.uncertainty.sweep import Results
 
 
 def show_sweep(result: JsonObject, scenario: Scenario) -> None:

@@ -19,18 +19,18 @@ import typer
 
 from diffabs.cli import console, progress, report, show, show_samples
 from diffabs.cli import engine as engines
-from diffabs.config.values import ScenarioError, unknown_name_error
 from diffabs.core.types import JsonObject, PyTree
-from diffabs.runtime import documents, files
+from diffabs.engine.admissible import first_refusal
+from diffabs.engine.drive.engine import EngineError
+from diffabs.host import documents, files
+from diffabs.host.values import ScenarioError, unknown_name_error
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import Scenario, dump, loads
-from diffabs.simulate.admissible import first_refusal
-from diffabs.simulate.drive.engine import EngineError
-from diffabs.sweep.sampling import MAX_UINT32
+from diffabs.uncertainty.sweep.sampling import MAX_UINT32
 
 if TYPE_CHECKING:
-    from diffabs.sweep import Results, Study
-    from diffabs.sweep import SweepProgress as Told
+    from diffabs.uncertainty.sweep import Results, Study
+    from diffabs.uncertainty.sweep import SweepProgress as Told
 
 PLACES = ("local", "dask")
 SUMMARY, FIGURES = "summary.json", "figures"
@@ -94,7 +94,7 @@ def sweep(
                     lambda: _write_files(result, results, study, out, numbers, figures), "writing the results"
                 )
         _show(result, setup, as_json)
-        from diffabs.sweep.checking import accuracy_warnings
+        from diffabs.uncertainty.sweep.checking import accuracy_warnings
 
         for line in accuracy_warnings(result["accuracy"]) if result["accuracy"] else ():
             console.say(f"warning: {line}")
@@ -110,7 +110,7 @@ def _show(result: JsonObject, scenario: Scenario, as_json: bool) -> None:
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
     """Return one sample of a sweep, from 0, as a scenario with the sample's values, and the random key of its noise."""
     console.need_extra("sweep")
-    from diffabs.sweep.store import SweepError, check_owner, describe_differences, read_manifest
+    from diffabs.uncertainty.sweep.store import SweepError, check_owner, describe_differences, read_manifest
 
     manifest = read_manifest(folder)
     source = manifest["source"]
@@ -180,7 +180,7 @@ def _check_options(on: str, scheduler: str | None, workers: int | None, devices:
 
 def _check_free(out: pathlib.Path, resume: bool) -> None:
     """Raise SweepError if a new sweep cannot begin in the folder."""
-    from diffabs.sweep.store import Store
+    from diffabs.uncertainty.sweep.store import Store
 
     if not resume:
         Store(out).check_free()
@@ -200,8 +200,8 @@ def _numbers(keep: str | None, samples: int) -> list[int]:
 
 def _with_engine(study: "Study", engine: str, out: pathlib.Path, resume: bool, remote: bool) -> "Study":
     """Return the study with its engine, "xla" or "kernel". A line on stderr says why "auto" became XLA."""
-    from diffabs.sweep.runner import find_study_objection
-    from diffabs.sweep.selection import choose_study_engine
+    from diffabs.uncertainty.sweep.runner import find_study_objection
+    from diffabs.uncertainty.sweep.selection import choose_study_engine
 
     study, why = console.run_with_progress(
         lambda: choose_study_engine(
@@ -219,11 +219,11 @@ def _with_engine(study: "Study", engine: str, out: pathlib.Path, resume: bool, r
 
 
 def _computer(name: str, scheduler: str | None, workers: int | None) -> Any:
-    from diffabs.sweep.engines import Local
+    from diffabs.uncertainty.sweep.engines import Local
 
     if name == "local":
         return Local()
-    from diffabs.sweep.cluster import Dask
+    from diffabs.uncertainty.sweep.cluster import Dask
 
     return Dask(scheduler, workers)
 
@@ -246,7 +246,7 @@ def _run(study: "Study", scenario: Scenario, out: pathlib.Path, resume: bool, on
         far[0] = progress.WorkProgress(words, at.samples, at.total)
 
     def run() -> "Results":
-        from diffabs.sweep import sweep as run
+        from diffabs.uncertainty.sweep import sweep as run
 
         source = {"scenario": dump(scenario), "name": scenario.name}
         return run(study, out, resume=resume, on=on(), progress=report_progress, stopping=ending, source=source)
@@ -259,8 +259,8 @@ def _result(results: "Results", study: "Study", out: pathlib.Path, check: int) -
 
     A picture that cannot be drawn then loses no statistics.
     """
-    from diffabs.sweep.checking import check_accuracy
-    from diffabs.sweep.statistics.summary import summarise_sweep
+    from diffabs.uncertainty.sweep.checking import check_accuracy
+    from diffabs.uncertainty.sweep.statistics.summary import summarise_sweep
 
     # Half steps run beside the statistics: compiled code and NumPy release Python's global lock.
     with ThreadPoolExecutor(1) as beside:
@@ -277,12 +277,12 @@ def _write_files(
     result: JsonObject, results: "Results", study: "Study", out: pathlib.Path, numbers: list[int], figures: bool
 ) -> None:
     """Write trajectories, figures and report, and add their names to the document here and in the folder."""
-    from diffabs.sweep.trajectories import write_trajectories
+    from diffabs.uncertainty.sweep.trajectories import write_trajectories
 
     if numbers:
         result["files"]["trajectories"] = str(write_trajectories(study, out, numbers))
     if figures:
-        from diffabs.plot.sweeps import draw_sweep
+        from diffabs.output.plot.sweeps import draw_sweep
 
         folder = out / FIGURES
         folder.mkdir(exist_ok=True)

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from diffabs.cli.console import fail, need_matplotlib
-from diffabs.runtime import files
+from diffabs.host import files
 from diffabs.scenario import outside
 from diffabs.scenario.scenario import names
 

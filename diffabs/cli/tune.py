@@ -16,11 +16,11 @@ import typer
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.cli import engine as engines
 from diffabs.core.types import JsonObject
+from diffabs.engine.run import rollout
+from diffabs.engine.types import Trajectory
 from diffabs.scenario.proving import Proved, certify_result, without_certificate
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.scenario.tuning import Work, build_work, describe_tuning
-from diffabs.simulate.run import rollout
-from diffabs.simulate.types import Trajectory
 
 if TYPE_CHECKING:
     from diffabs.tune import Tuned, TuningProgress
@@ -182,7 +182,7 @@ def _format_progress(history: "list[TuningProgress]", max_iterations: int | None
 
 def _draw(work: Work, tuned: "Tuned", path: pathlib.Path) -> None:
     """Draw the history, and the run that is worst after the tuning, before and after it."""
-    from diffabs.plot.tuning import draw_tuning
+    from diffabs.output.plot.tuning import draw_tuning
 
     scenario, metrics = work.scenario, tuned.metrics[1]
     worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in scenario.tune.objective.items())))

@@ -17,7 +17,7 @@ A continuous PID, a sampled controller and a relay thus fit into one loop. No co
 a contract by its methods and attributes.
 
 A plant declares its outputs, a NamedTuple of signals with their `units`: a `BrakeOutput`, a `BalanceOutput`, or another
-one. The target refers to the first output. `simulate/contracts` checks a loop before its first run. It refuses a part
+one. The target refers to the first output. `engine/contracts` checks a loop before its first run. It refuses a part
 that returns something else than its contract says, or that reads an output which the plant lacks.
 
 Optional methods or attributes of a part's class, beyond its contract:
@@ -198,7 +198,8 @@ class Objective(Protocol):
     """A metric of a run, accumulated step by step: a sweep stores no trajectories.
 
     A run whose value is outside `physical`, or NaN, has `diverged`. An objective may have an attribute `unreached`, the
-    infinite value of a run that does not reach the measured condition, or NaN for a run that has no such metric.
+    infinite value of a run that does not reach the measured condition, or NaN for a run that has no such metric. One
+    whose attribute `counts_kinks` is True sums something over the bends of a signal.
     """
 
     @property

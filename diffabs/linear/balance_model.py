@@ -20,8 +20,8 @@ from diffabs.core.rules import Rule
 from diffabs.linear.linearization import StateSpace, linearize
 from diffabs.linear.slip_model import Continuous, Sampling, SlipModel
 from diffabs.linear.zero_order_hold import discretise_held_input
-from diffabs.plants import ArmBalance, BalanceStart
-from diffabs.plants.arm_balance import ArmState
+from diffabs.parts.plants import ArmBalance, BalanceStart
+from diffabs.parts.plants.arm_balance import ArmState
 
 
 @pytree

@@ -13,8 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from diffabs.controllers import ObserverFeedback, Sampled
-from diffabs.controllers.balance import MEASURED_NAMES, STATE_NAMES
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Plant
 from diffabs.core.renamed import refuse_old_names
@@ -25,6 +23,8 @@ from diffabs.linear.regulator import dlqr
 from diffabs.linear.riccati import dare, symmetric_part
 from diffabs.linear.slip_model import Sampling
 from diffabs.linear.weights import as_weight_matrix, check_symmetric
+from diffabs.parts.controllers import ObserverFeedback, Sampled
+from diffabs.parts.controllers.balance import MEASURED_NAMES, STATE_NAMES
 
 SELECTION = np.eye(len(STATE_NAMES))[[STATE_NAMES.index(name) for name in MEASURED_NAMES]]  # C: theta and psi
 

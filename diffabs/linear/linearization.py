@@ -21,7 +21,7 @@ from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import AnyArray, Array, Bool, PyTree, Scalar
-from diffabs.plants.wheel import FROZEN_OUTPUTS
+from diffabs.parts.plants.wheel import FROZEN_OUTPUTS
 
 # Newton iterations that bring the remaining states to rest; one is enough where their equation is linear.
 REMAINING_STATE_ITERATIONS = 10

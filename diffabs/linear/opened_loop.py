@@ -20,8 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from diffabs.actuators import Delay
-from diffabs.controllers import Sampled
 from diffabs.core.blocks import Direct, Series, offers
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
@@ -34,6 +32,8 @@ from diffabs.linear.linearization import check_kink, coordinate_moves, independe
 from diffabs.linear.operating_point import MAX_REST_RESIDUE, find_root
 from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer, check_transfer
 from diffabs.linear.zero_order_hold import hold_input
+from diffabs.parts.actuators import Delay
+from diffabs.parts.controllers import Sampled
 
 # Relative offsets of the target for the first Newton step of a controller, in the directions that leave a limit.
 TARGET_OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)

@@ -24,7 +24,7 @@ from diffabs.core.protocols import Block, Feedforward, Memory, Plant, Reference,
 from diffabs.core.pytree import canonical_dtypes, part, pytree, static
 from diffabs.core.types import AnyArray, Array, Bool, Matrix, Part, PyTree, Scalar
 from diffabs.linear.linearization import StateSpace, check_kink, is_kinked, nan_at_kink
-from diffabs.stops import NoStop
+from diffabs.parts.stops import NoStop
 
 ROOT_ITERATIONS = 10  # Gauss-Newton iterations to the point of rest; one is enough where the loop is linear
 MAX_REST_RESIDUE = 1e-6  # largest residue of a point of rest, relative to the state

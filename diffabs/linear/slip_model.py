@@ -10,8 +10,6 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from diffabs.actuators import Lag
-from diffabs.controllers.sampled import sampling_rules
 from diffabs.core.blocks import Direct
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
@@ -28,8 +26,10 @@ from diffabs.linear.linearization import (
     used_leaves,
 )
 from diffabs.linear.zero_order_hold import discretise_held_input
-from diffabs.plants import BrakeStart, MirroredRig
-from diffabs.plants.wheel import FROZEN_OUTPUTS
+from diffabs.parts.actuators import Lag
+from diffabs.parts.controllers.sampled import sampling_rules
+from diffabs.parts.plants import BrakeStart, MirroredRig
+from diffabs.parts.plants.wheel import FROZEN_OUTPUTS
 
 
 @pytree

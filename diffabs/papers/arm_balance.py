@@ -15,24 +15,24 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs.controllers import BalanceFeedback
 from diffabs.core.loop import Loop
 from diffabs.core.numerics import spectral_bound
 from diffabs.core.pytree import replace
 from diffabs.core.types import AnyArray, JsonObject, Part, PyTree, Table
-from diffabs.design.attraction import Basin, Cells, Reach, largest_recovered_multiples, region_of_attraction
+from diffabs.engine.run import rollout
+from diffabs.engine.types import Adaptive, FixedStep, Run, describe_solver
+from diffabs.host import provenance
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.linearization import StateSpace
 from diffabs.linear.recoverable import mode_bounds, transmission_zeros
 from diffabs.linear.regulator import lqr
-from diffabs.objectives import BALANCE
 from diffabs.papers import arm_equations, arm_figures, record
 from diffabs.papers.digest import Digest, Refuted, digest
-from diffabs.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
-from diffabs.runtime import provenance
+from diffabs.parts.controllers import BalanceFeedback
+from diffabs.parts.objectives import BALANCE
+from diffabs.parts.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
+from diffabs.robust.design.attraction import Basin, Cells, Reach, largest_recovered_multiples, region_of_attraction
 from diffabs.scenario.defaults import balancing
-from diffabs.simulate.run import rollout
-from diffabs.simulate.types import Adaptive, FixedStep, Run, describe_solver
 
 TITLE = "Fumita: a two-wheeler balanced by an arm"
 SOLVER = FixedStep(step=1e-3, duration=10.0)
@@ -70,7 +70,8 @@ NOTES = [
     "The independent solution has 0.046 and 0.116 for the recovered multiples at 24 and 100 V; here they are "
     "0.0454 and 0.1146, and SciPy's DOP853 on separately written equations falls from 0.0456 and from 0.1148 too.",
     "Recovered means: the run comes into an ellipsoid from which the nonlinear loop at its voltage limit provably "
-    "returns (diffabs.design.capture). A run that neither does so nor falls in time is undecided, and counted apart. "
+    "returns (diffabs.robust.design.capture). A run that neither does so nor falls in time is undecided, and counted "
+    "apart. "
     "A multiple counts as recovered if all smaller ones tried are. Shares are by area: starts are centres of cells.",
 ]
 
@@ -199,8 +200,8 @@ def robust_gains(progress: Callable[[str], None]) -> JsonObject:
     gains = {"LQR for 50 kg": lqr_gain(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": np.array(TUNED)}
     progress("arm-balance: a gain for 40 to 100 kg")
     try:
-        from diffabs.design import Spec, design
-        from diffabs.design.parameter_grid import grid_polytope
+        from diffabs.robust.design import Spec, design
+        from diffabs.robust.design.parameter_grid import grid_polytope
 
         over = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (700.0, 1300.0), "plant.damping": (70.0, 130.0)}
         solution = design(grid_polytope(BalanceModel(plant=HANGING), over), Spec(Q=WEIGHTS, R=EFFORT))
@@ -319,4 +320,4 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
         "made": provenance.describe_making(("reproduce", "arm-balance")),
         "versions": record.origin_of_numbers(),
     }
-    return record.write_summary(folder, summary)
+    return record.write_summary(folder, summary, compact)

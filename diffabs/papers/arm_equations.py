@@ -10,7 +10,7 @@ import numpy as np
 
 from diffabs.core.types import AnyArray, JsonObject, Scalar, Vector
 from diffabs.papers import record
-from diffabs.plants import ArmBalance
+from diffabs.parts.plants import ArmBalance
 
 # Half the length of a uniform rod with the inertia of each body.
 RODS = {"body": "body_height", "arm": "arm_length", "rider": "rider_height"}

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from diffabs import plot
 from diffabs.core.types import JsonObject, PyTree
-from diffabs.design.attraction import Basin, Reach
+from diffabs.engine.types import Run
 from diffabs.linear.recoverable import mode_bounds
-from diffabs.simulate.types import Run
+from diffabs.output import plot
+from diffabs.robust.design.attraction import Basin, Reach
 
 
 def figures(

@@ -11,9 +11,9 @@ import jax
 import numpy as np
 
 from diffabs.core.types import JsonObject, Table
+from diffabs.engine.types import Run
 from diffabs.papers import record
-from diffabs.roads import peak
-from diffabs.simulate.types import Run
+from diffabs.parts.roads import peak
 
 KMH = 3.6
 LATE_TIME = 0.45  # s; later the torque is built up in every run

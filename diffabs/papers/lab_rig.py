@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs import plot
-from diffabs.controllers import ConstantTorque
 from diffabs.core.blocks import Direct
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import get, param, part, pytree
 from diffabs.core.types import JsonObject, Params, Scalar, Table, Vector
-from diffabs.identify import Identified, Tolerances, fit
+from diffabs.engine.types import FixedStep, Run
+from diffabs.host import provenance
+from diffabs.output import plot
 from diffabs.papers import record
 from diffabs.papers.digest import Digest
 from diffabs.papers.measured_rig import (
@@ -47,11 +47,11 @@ from diffabs.papers.measured_rig import (
     solver_for,
     with_values,
 )
-from diffabs.plants import BrakeStart, LabRig
-from diffabs.runtime import provenance
+from diffabs.parts.controllers import ConstantTorque
+from diffabs.parts.plants import BrakeStart, LabRig
+from diffabs.parts.stops import Standstill
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.types import FixedStep, Run
-from diffabs.stops import Standstill
+from diffabs.tune.identify import Identified, Tolerances, fit
 
 TITLE = "INTECO's laboratory rig: measured against simulated (relay at slip 0.1 and 0.7, from 1,700 rpm)"
 PIXEL = {"wheel": 0.35, "drum": 0.5}  # rad/s, of the coasting curves
@@ -489,7 +489,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None], data: pathl
         "made": provenance.describe_making(("reproduce", "lab-rig")),
         "versions": record.origin_of_numbers(),
     }
-    return record.write_summary(folder, summary)
+    return record.write_summary(folder, summary, compact)
 
 
 MASK_VALUES: Params = {"loop.actuator.rise": 1e-3, "loop.actuator.fall": 1e-3}  # the mask has no dead time: one step

@@ -21,20 +21,20 @@ from typing import Any, cast
 import jax
 import numpy as np
 
-from diffabs import plot
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Table
 from diffabs.core.units import resolve_unit, units_of
+from diffabs.engine.run import run_unchecked
+from diffabs.engine.types import Run
+from diffabs.host import files, provenance
+from diffabs.output import plot
 from diffabs.papers import record
 from diffabs.papers.digest import Digest
-from diffabs.plants import GRAVITY, RoadVehicle
-from diffabs.runtime import files, provenance
+from diffabs.parts.plants import GRAVITY, RoadVehicle
+from diffabs.parts.stops import Standstill
 from diffabs.scenario import outside
 from diffabs.scenario.scenario import Scenario, load
-from diffabs.simulate.run import run_unchecked
-from diffabs.simulate.types import Run
-from diffabs.stops import Standstill
 
 TITLE = "Printed numbers of published anti-lock simulations, computed again"
 SHOWN = "literature-mathworks"  # scenario that stands for all in the report
@@ -304,7 +304,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
         "made": provenance.describe_making(("reproduce", "literature")),
         "versions": record.origin_of_numbers(),
     }
-    return record.write_summary(folder, summary)
+    return record.write_summary(folder, summary, compact)
 
 
 def _by_source(rows: list[JsonObject]) -> Iterator[list[JsonObject]]:

@@ -11,10 +11,10 @@ from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
 
 from diffabs.core.numerics import spectral_bound
 from diffabs.core.types import AnyArray, JsonObject
-from diffabs.design import Polytope
 from diffabs.papers import record
 from diffabs.papers.lmi_design import DESIGN_BOX, K1, PUBLISHED_GAIN
-from diffabs.plants import GRAVITY, LabRig
+from diffabs.parts.plants import GRAVITY, LabRig
+from diffabs.robust.design import Polytope
 
 CAR, PERSON, RIG = 1000.0, 60.0, 5.0  # kg
 

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from diffabs import plot
 from diffabs.core.types import JsonObject
-from diffabs.design import Certificate, Design, Polytope, Spec, certify, design
-from diffabs.design.parameter_box import polytope, schedule
+from diffabs.engine.types import Run
 from diffabs.linear.slip_model import SlipModel
+from diffabs.output import plot
 from diffabs.papers import record
 from diffabs.papers.digest import Refuted
-from diffabs.plants import MirroredRig
-from diffabs.simulate.types import Run
+from diffabs.parts.plants import MirroredRig
+from diffabs.robust.design import Certificate, Design, Polytope, Spec, certify, design
+from diffabs.robust.design.parameter_box import polytope, schedule
 
 K1 = 11753.0
 PUBLISHED_GAIN = (-K1, -48.0)

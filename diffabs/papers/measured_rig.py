@@ -21,22 +21,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.actuators import DeadTime
-from diffabs.config.values import ScenarioError
-from diffabs.controllers import ConstantTorque, PlayedCommand, Relay, Sampled
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import param, part, pytree, replace
 from diffabs.core.types import JsonObject, Params, Scalar, Vector
-from diffabs.identify import Identified, Tolerances, fit
-from diffabs.plants import BrakeStart, LabRig
-from diffabs.references import FixedSlip
-from diffabs.roads import RIG_UNROUNDED
-from diffabs.runtime import files
+from diffabs.engine.run import run_unchecked
+from diffabs.engine.types import FixedStep, Run
+from diffabs.host import files
+from diffabs.host.values import ScenarioError
+from diffabs.parts.actuators import DeadTime
+from diffabs.parts.controllers import ConstantTorque, PlayedCommand, Relay, Sampled
+from diffabs.parts.plants import BrakeStart, LabRig
+from diffabs.parts.references import FixedSlip
+from diffabs.parts.roads import RIG_UNROUNDED
+from diffabs.parts.sensors import EncoderSlip
+from diffabs.parts.stops import Standstill
 from diffabs.scenario.defaults import braking
-from diffabs.sensors import EncoderSlip
-from diffabs.simulate.run import run_unchecked
-from diffabs.simulate.types import FixedStep, Run
-from diffabs.stops import Standstill
+from diffabs.tune.identify import Identified, Tolerances, fit
 
 PERIOD = 0.01  # s, sampling of the rig's computer
 RUN_STEP = 1.25e-4  # s; stable down to standstill, with the mask's friction down to 0.07 m/s

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -13,10 +13,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from diffabs import plot
 from diffabs.core.types import JsonObject, Params, Scalar
-from diffabs.runtime import files, provenance
-from diffabs.simulate.types import FixedStep, Run
+from diffabs.engine.types import FixedStep, Run
+from diffabs.host import files, provenance
+from diffabs.output import plot
+from diffabs.papers.digest import Digest
 
 
 def lane(run: Run, i: int) -> Run:
@@ -64,9 +65,17 @@ def origin_of_numbers() -> dict[str, str]:
     return provenance.describe_platform("jaxlib", "numpy", "matplotlib") | provenance.source_commit()
 
 
-def write_summary(folder: pathlib.Path, summary: JsonObject, name: str = "summary.json") -> JsonObject:
-    """Write a summary atomically, and return it as it reads back from the file."""
-    text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False)
+def write_summary(
+    folder: pathlib.Path,
+    summary: JsonObject,
+    compact: Callable[[Params], Digest] | None = None,
+    name: str = "summary.json",
+) -> JsonObject:
+    """Write a summary atomically, with its digest if `compact` makes one, and return it as it reads back."""
+    content = json.loads(json.dumps(summary, allow_nan=False))
+    if compact:
+        content["digest"] = compact(content)._asdict()
+    text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
     files.write_file(folder / name, f"{text}\n".encode())
     return json.loads(text)
 
@@ -106,4 +115,4 @@ def experiment(config: Any, results: Params, figures: Params) -> JsonObject:
     folder.mkdir(parents=True, exist_ok=True)
     names = save_figures(figures, folder)
     whole = {"config": dataclasses.asdict(config), **results, "figures": names, "versions": origin_of_numbers()}
-    return write_summary(folder, whole, "results.json")
+    return write_summary(folder, whole, name="results.json")

@@ -13,23 +13,23 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from diffabs import plot
-from diffabs.controllers import PID, ConstantTorque
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Reference
 from diffabs.core.types import JsonObject, Table
-from diffabs.objectives import BRAKING
+from diffabs.engine.run import rollout, run_unchecked
+from diffabs.engine.types import FixedStep, Run
+from diffabs.host import provenance
+from diffabs.loop.batch import stack_loops
+from diffabs.loop.ensemble import run_batch
+from diffabs.output import plot
 from diffabs.papers import estimator_claims, record
 from diffabs.papers.digest import Digest, Refuted, digest
-from diffabs.plants import GRAVITY, QuarterCar
-from diffabs.references import FixedSlip, PeakLatch, PeakLiteral
-from diffabs.roads import MagicFormula, peak
-from diffabs.runtime import provenance
+from diffabs.parts.controllers import PID, ConstantTorque
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.plants import GRAVITY, QuarterCar
+from diffabs.parts.references import FixedSlip, PeakLatch, PeakLiteral
+from diffabs.parts.roads import MagicFormula, peak
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.batch import stack_loops
-from diffabs.simulate.ensemble import run_batch
-from diffabs.simulate.run import rollout, run_unchecked
-from diffabs.simulate.types import FixedStep, Run
 
 TITLE = "Aoki and Nakamura: anti-lock braking at the estimated best slip (quarter car, from 100 km/h)"
 SOLVER = FixedStep(step=5e-5, duration=3.6, every=20)
@@ -242,7 +242,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
         "made": provenance.describe_making(("reproduce", "slip-estimator")),
         "versions": record.origin_of_numbers(),
     }
-    return record.write_summary(folder, summary)
+    return record.write_summary(folder, summary, compact)
 
 
 def _step_note(results: EstimatorResults) -> str:

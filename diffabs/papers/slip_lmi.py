@@ -14,23 +14,23 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import plot
-from diffabs.controllers import HoldingInput, StateFeedback
 from diffabs.core.loop import Loop
 from diffabs.core.types import JsonObject, Table
-from diffabs.objectives import BRAKING
+from diffabs.engine.run import rollout
+from diffabs.engine.types import FixedStep, Run, Trajectory
+from diffabs.host import provenance
+from diffabs.loop.batch import stack_loops
+from diffabs.loop.ensemble import run_batch
+from diffabs.output import plot
 from diffabs.papers import lmi_claims, lmi_design, record
 from diffabs.papers.digest import Digest, digest
-from diffabs.plants import BrakeStart, MirroredRig
-from diffabs.references import FilteredSlip, FixedSlip
-from diffabs.roads import RIG, peak
-from diffabs.runtime import provenance
+from diffabs.parts.controllers import HoldingInput, StateFeedback
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.plants import BrakeStart, MirroredRig
+from diffabs.parts.references import FilteredSlip, FixedSlip
+from diffabs.parts.roads import RIG, peak
+from diffabs.parts.stops import SpeedReached
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.batch import stack_loops
-from diffabs.simulate.ensemble import run_batch
-from diffabs.simulate.run import rollout
-from diffabs.simulate.types import FixedStep, Run, Trajectory
-from diffabs.stops import SpeedReached
 
 TITLE = "Maeda and Sugiura: robust LQ control of an anti-lock brake (mirrored rig, 50 to 5 km/h)"
 STEP_S = 2e-5  # s; 5e-5 gives relative errors above 1e-6 at the torque limits
@@ -260,7 +260,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> JsonObje
         "made": provenance.describe_making(("reproduce", "slip-lmi")),
         "versions": record.origin_of_numbers(),
     }
-    return record.write_summary(folder, summary)
+    return record.write_summary(folder, summary, compact)
 
 
 def compact(summary: Table) -> Digest:

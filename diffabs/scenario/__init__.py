@@ -5,7 +5,7 @@ Exports `load`, `loads`, `dump`, `names`, `Scenario` and `ScenarioError`.
 
 from typing import TYPE_CHECKING
 
-from diffabs.runtime.exports import lazy_getattr
+from diffabs.host.exports import lazy_getattr
 
 if TYPE_CHECKING:
     from diffabs.scenario.scenario import Scenario as Scenario

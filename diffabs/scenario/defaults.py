@@ -2,7 +2,7 @@
 
 from diffabs.core.loop import Loop
 from diffabs.core.types import Part
-from diffabs.plants import ArmBalance, QuarterCar
+from diffabs.parts.plants import ArmBalance, QuarterCar
 
 
 def braking(**parts: Part) -> Loop:

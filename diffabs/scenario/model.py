@@ -8,8 +8,8 @@ import numpy as np
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Scalar
 from diffabs.core.units import units_of
+from diffabs.engine.types import describe_solver
 from diffabs.scenario import registry
-from diffabs.simulate.types import describe_solver
 
 if TYPE_CHECKING:
     from diffabs.scenario.scenario import Scenario

@@ -21,7 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.config.values import (
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import ParameterSpec, parameters
+from diffabs.core.types import JsonObject, PyTree, Table
+from diffabs.host.values import (
     Reader,
     ScenarioError,
     as_plain,
@@ -34,9 +37,6 @@ from diffabs.config.values import (
     unknown_name_error,
     wrong_kind_error,
 )
-from diffabs.core.protocols import Objective
-from diffabs.core.pytree import ParameterSpec, parameters
-from diffabs.core.types import JsonObject, PyTree, Table
 from diffabs.scenario.registry import KMH, MAX_DEPTH, in_kmh
 from diffabs.scenario.toml import parse_value
 

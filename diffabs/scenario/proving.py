@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from diffabs.config.values import ScenarioError
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
+from diffabs.host.values import ScenarioError
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
-    from diffabs.design import Certificate
-    from diffabs.design.findings import FurtherFindings
-    from diffabs.design.loop_task import ProofTask
+    from diffabs.robust.design import Certificate
+    from diffabs.robust.design.findings import FurtherFindings
+    from diffabs.robust.design.loop_task import ProofTask
 
 # Keys of the JSON document; without a certificate most are null.
 FROM_PROOF = ("quadratically_stable", "stable", "verified_exactly", "decay_rate", "damping", "trace_cost",
@@ -62,10 +62,10 @@ def build_proof_task(
     """
     if weighed and scenario.design.Q is None:
         raise ScenarioError("design.Q and design.R are missing: a design minimises the cost that they weigh")
-    from diffabs.design import Spec
-    from diffabs.design.loop_task import build_loop_task
-    from diffabs.design.sdp import solver
-    from diffabs.design.state_feedback import reduce_loop
+    from diffabs.robust.design import Spec
+    from diffabs.robust.design.loop_task import build_loop_task
+    from diffabs.robust.design.sdp import solver
+    from diffabs.robust.design.state_feedback import reduce_loop
 
     reduced, design = reduce_loop(scenario.loop), scenario.design
     states = reduced.model.states
@@ -85,7 +85,7 @@ def certify_result(scenario: Scenario) -> Proved:
     The certificate has the fastest decay rate that is found. If [tune] requires a faster one, it has that one if it can
     be proved. Without a certificate the outcome gives the reason; no error is raised.
     """
-    from diffabs.design import findings
+    from diffabs.robust.design import findings
 
     decay = scenario.tune.decay
     try:
@@ -126,7 +126,7 @@ def describe_proof(
         further: Results without a common Lyapunov matrix.
         **numbers: Further values by key: "lower_bound", "gap", "residual" and "trace_cost" of a design.
     """
-    from diffabs.design.findings import slowest_vertex
+    from diffabs.robust.design.findings import slowest_vertex
 
     summary: JsonObject = proof.summary() if proof else {}
     if proof:

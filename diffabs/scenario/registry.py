@@ -18,8 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from diffabs import actuators, controllers, objectives, plants, references, roads, sensors, stops
-from diffabs.config.values import (
+from diffabs.core import blocks, protocols
+from diffabs.core.loop import Loop
+from diffabs.core.meanings import field_meanings
+from diffabs.core.pytree import ParameterSpec
+from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
+from diffabs.core.units import Units, resolve_unit, units_inside, units_of
+from diffabs.host.values import (
     READER_BY_TYPE,
     ScenarioError,
     dotted_path,
@@ -31,12 +36,7 @@ from diffabs.config.values import (
     unknown_name_error,
     wrong_kind_error,
 )
-from diffabs.core import blocks, protocols
-from diffabs.core.loop import Loop
-from diffabs.core.meanings import field_meanings
-from diffabs.core.pytree import ParameterSpec
-from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
-from diffabs.core.units import Units, resolve_unit, units_inside, units_of
+from diffabs.parts import actuators, controllers, objectives, plants, references, roads, sensors, stops
 from diffabs.scenario import outside
 from diffabs.scenario.defaults import braking
 

@@ -23,8 +23,19 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs.config.values import ScenarioError as ScenarioError
-from diffabs.config.values import (
+from diffabs.core.jax_flags import default_flags
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import get
+from diffabs.core.types import JsonObject, Table
+from diffabs.core.units import units_of
+from diffabs.core.validity import find_cautions, find_problems
+from diffabs.engine.admissible import find_mismatches, find_unstable_step
+from diffabs.engine.contracts import find_misfits
+from diffabs.engine.types import Adaptive, Solver
+from diffabs.host import files
+from diffabs.host.values import ScenarioError as ScenarioError
+from diffabs.host.values import (
     as_plain,
     format_given,
     make_printable,
@@ -33,15 +44,7 @@ from diffabs.config.values import (
     unknown_name_error,
     wrong_kind_error,
 )
-from diffabs.core.jax_flags import default_flags
-from diffabs.core.loop import Loop
-from diffabs.core.protocols import Objective
-from diffabs.core.pytree import get
-from diffabs.core.types import JsonObject, Table
-from diffabs.core.units import units_of
-from diffabs.core.validity import find_cautions, find_problems
-from diffabs.objectives import BRAKING, default_objectives
-from diffabs.runtime import files
+from diffabs.parts.objectives import BRAKING, default_objectives
 from diffabs.scenario import parameter_paths, section_design, section_solver, section_sweep, section_tune, toml
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.registry import (
@@ -55,9 +58,6 @@ from diffabs.scenario.registry import (
     name_of,
     type_name,
 )
-from diffabs.simulate.admissible import find_mismatches, find_unstable_step
-from diffabs.simulate.contracts import find_misfits
-from diffabs.simulate.types import Adaptive, Solver
 
 MAX_SCENARIO_BYTES = 1_000_000  # bytes of a file
 MAX_WRITTEN_BYTES = 10 * MAX_SCENARIO_BYTES  # bytes of a text in a document, which `dump` writes with all digits
@@ -119,7 +119,7 @@ class Scenario:
 
 def names() -> list[str]:
     """Return the names of the packaged scenarios."""
-    folder = importlib.resources.files("diffabs") / "scenarios"
+    folder = importlib.resources.files("diffabs.scenario") / "scenarios"
     return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
 
 
@@ -206,7 +206,7 @@ def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
         raise ScenarioError("the name of the scenario is empty")
     path, quoted = pathlib.Path(name_or_path), format_given(str(name_or_path), MAX_PATH_LENGTH)
     if str(name_or_path) in names():
-        file = importlib.resources.files("diffabs") / "scenarios" / f"{name_or_path}.toml"
+        file = importlib.resources.files("diffabs.scenario") / "scenarios" / f"{name_or_path}.toml"
         return str(name_or_path), file.read_bytes()
     try:
         if len(path.parts) == 1 and not path.suffix and not path.exists():

@@ -16,8 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.actuators import Lag, RateLimit
-from diffabs.config.values import (
+from diffabs.core.blocks import Series
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import ParameterSpec, parameters
+from diffabs.core.types import JsonObject, Matrix, Scalar
+from diffabs.host.values import (
     ScenarioError,
     format_given,
     plain_fields,
@@ -28,13 +31,10 @@ from diffabs.config.values import (
     table_reader,
     wrong_kind_error,
 )
-from diffabs.config.values import read_table as read_table
-from diffabs.controllers import Sampled
-from diffabs.core.blocks import Series
-from diffabs.core.loop import Loop
-from diffabs.core.pytree import ParameterSpec, parameters
-from diffabs.core.types import JsonObject, Matrix, Scalar
+from diffabs.host.values import read_table as read_table
 from diffabs.linear.slip_model import SlipModel
+from diffabs.parts.actuators import Lag, RateLimit
+from diffabs.parts.controllers import Sampled
 from diffabs.scenario.parameter_paths import canonical_path, interval_table, read_entries
 
 ENTRY = ParameterSpec("1")

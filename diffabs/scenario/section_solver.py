@@ -6,11 +6,11 @@ Without a type, `step` or `kinks` select fixed steps. Otherwise, and always with
 import dataclasses
 from collections.abc import Mapping
 
-from diffabs.config.values import plain_fields, range_reader, read_one, read_switch, table_field, whole_reader
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject
-from diffabs.simulate.admissible import MAX_SOLVER_STEPS
-from diffabs.simulate.types import SOLVER_TYPES, Adaptive, FixedStep, Solver
+from diffabs.engine.admissible import MAX_SOLVER_STEPS
+from diffabs.engine.types import SOLVER_TYPES, Adaptive, FixedStep, Solver
+from diffabs.host.values import plain_fields, range_reader, read_one, read_switch, table_field, whole_reader
 
 TIME_SPEC = ParameterSpec("s", low=0.0, open_low=True)
 TOLERANCE_SPEC = ParameterSpec("1", low=1e-12, high=0.01)

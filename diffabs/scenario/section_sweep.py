@@ -19,8 +19,8 @@
     [sweep.failures]
     overshoot = 0.5                                           # more is a failure; so is not to stop, or to lock
 
-The distributions are those of `diffabs.sweep.distributions`. Reading the section needs no extra, except for files.
-Running the sweep needs the extra `sweep`.
+The distributions are those of `diffabs.uncertainty.sweep.distributions`. Reading the section needs no extra, except
+for files. Running the sweep needs the extra `sweep`.
 """
 
 import dataclasses
@@ -28,7 +28,11 @@ import pathlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from diffabs.config.values import (
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import ParameterSpec, elements, get
+from diffabs.core.types import JsonObject, Params, PyTree, Table
+from diffabs.host.values import (
     ScenarioError,
     as_plain,
     choice_reader,
@@ -41,11 +45,7 @@ from diffabs.config.values import (
     whole_reader,
     wrong_kind_error,
 )
-from diffabs.config.values import read_table as read_table
-from diffabs.core.loop import Loop
-from diffabs.core.protocols import Objective
-from diffabs.core.pytree import ParameterSpec, elements, get
-from diffabs.core.types import JsonObject, Params, PyTree, Table
+from diffabs.host.values import read_table as read_table
 from diffabs.scenario.parameter_paths import (
     ParameterEntry,
     flatten_table,
@@ -55,11 +55,11 @@ from diffabs.scenario.parameter_paths import (
     read_entries,
 )
 from diffabs.scenario.registry import build_part, describe_missing_inner_parts, family_of, unit_of
-from diffabs.sweep import distributions, sampling
-from diffabs.sweep.variables import Correlation, Space, read_correlation
+from diffabs.uncertainty.sweep import distributions, sampling
+from diffabs.uncertainty.sweep.variables import Correlation, Space, read_correlation
 
 if TYPE_CHECKING:
-    from diffabs.sweep import Study
+    from diffabs.uncertainty.sweep import Study
 
 DEFAULT_SAMPLES = 1000  # for a sampling design without a number of points of its own
 PARTS = {field.name for field in dataclasses.fields(Loop)} | {"road"}
@@ -199,7 +199,7 @@ def _with_numbers(table: Table, where: str, folder: pathlib.Path) -> Table:
         raise ScenarioError(f"{where}.column is missing: name a column of {format_given(table['file'])}")
     file, column = (read_text(table[key], f"{where}.{key}") for key in ("file", "column"))
     try:
-        from diffabs.sweep import sample_files
+        from diffabs.uncertainty.sweep import sample_files
     except ImportError:
         raise ScenarioError(f'{where}: reading a file needs pip install ".[sweep]" in a clone') from None
     try:
@@ -227,7 +227,7 @@ def _choice(key: str, value: PyTree, default: Any) -> Choice:
 
 def build_study(scenario: Any) -> "Study":
     """Return the sweep of a scenario."""
-    from diffabs.sweep import Study
+    from diffabs.uncertainty.sweep import Study
 
     plan: SweepSection = scenario.sweep
     if not plan.over:

@@ -29,7 +29,11 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from diffabs.config.values import (
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import ParameterSpec, parameters
+from diffabs.core.types import JsonObject, Table
+from diffabs.host.values import (
     ScenarioError,
     plain_fields,
     range_reader,
@@ -39,11 +43,8 @@ from diffabs.config.values import (
     table_reader,
     whole_reader,
 )
-from diffabs.config.values import read_table as read_table
-from diffabs.core.loop import Loop
-from diffabs.core.protocols import Objective
-from diffabs.core.pytree import ParameterSpec, parameters
-from diffabs.core.types import JsonObject, Table
+from diffabs.host.values import read_table as read_table
+from diffabs.loop.batch import Batch, grid, latin
 from diffabs.scenario.parameter_paths import (
     Ends,
     ParameterEntry,
@@ -55,7 +56,6 @@ from diffabs.scenario.parameter_paths import (
     read_entries,
 )
 from diffabs.scenario.registry import unit_of
-from diffabs.simulate.batch import Batch, grid, latin
 from diffabs.tune import risk
 
 DECLARED_RANGE = "declared"

@@ -4,8 +4,8 @@ import json
 import re
 import tomllib
 
-from diffabs.config.values import ScenarioError, format_given
 from diffabs.core.types import JsonObject, PyTree
+from diffabs.host.values import ScenarioError, format_given
 
 MOST_LEVELS = 50  # of nested tables and lists; a scenario has fewer than 5
 MAX_INTEGER = 2**63  # bound of whole numbers: TOML has 64 bits

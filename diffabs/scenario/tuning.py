@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from diffabs.config.values import ScenarioError
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import JsonObject, Part, Scalar
+from diffabs.engine.admissible import first_refusal
+from diffabs.host.values import ScenarioError
 from diffabs.scenario import proving
 from diffabs.scenario.proving import Proved
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.admissible import first_refusal
 
 if TYPE_CHECKING:
-    from diffabs.design.loop_task import ProofTask
+    from diffabs.robust.design.loop_task import ProofTask
     from diffabs.tune import Batch, Tuned
 
 WHEN = ("before", "after")

@@ -3,12 +3,12 @@
 import sys
 from typing import TYPE_CHECKING
 
-from diffabs.runtime.exports import CallablePackage, lazy_getattr
+from diffabs.host.exports import CallablePackage, lazy_getattr
 
 if TYPE_CHECKING:
     from diffabs.core.reason import Reason as Reason
-    from diffabs.simulate.batch import grid as grid
-    from diffabs.simulate.batch import latin as latin
+    from diffabs.loop.batch import grid as grid
+    from diffabs.loop.batch import latin as latin
     from diffabs.tune.constraints import AtMost as AtMost
     from diffabs.tune.constraints import CertifiedDecay as CertifiedDecay
     from diffabs.tune.constraints import Poles as Poles

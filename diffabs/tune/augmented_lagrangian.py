@@ -28,7 +28,7 @@ import optax
 from diffabs.core.pytree import get
 from diffabs.core.reason import Reason
 from diffabs.core.types import PyTree
-from diffabs.simulate.drive.engine import describe_engine
+from diffabs.engine.drive.engine import describe_engine
 from diffabs.tune.descent import Descent, DescentState, Optimiser, lbfgs, slice_start
 from diffabs.tune.method import Method
 from diffabs.tune.problem import Multipliers, ObjectiveEvaluation, Problem

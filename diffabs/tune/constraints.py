@@ -12,9 +12,9 @@ import jax.numpy as jnp
 
 from diffabs.core.loop import Loop
 from diffabs.core.types import Params, PyTree, Scalar
-from diffabs.design.interior.decay_rate import certified_decay
-from diffabs.design.polytopes import Polytope
-from diffabs.design.state_feedback import feedback_gain
+from diffabs.robust.design.interior.decay_rate import certified_decay
+from diffabs.robust.design.polytopes import Polytope
+from diffabs.robust.design.state_feedback import feedback_gain
 
 MIN_POLE_MAGNITUDE = 1e-9  # |z| below which a discrete pole decays within one period
 

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.actuators import Delay
-from diffabs.controllers import ConstantInput, NoFeedforward, Relay, SampledOnGrid, SlidingMode
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace, stack_lists
 from diffabs.core.types import Params, Part, PyTree
-from diffabs.simulate.batch import Batch
-from diffabs.simulate.types import FixedStep, Solver
+from diffabs.engine.types import FixedStep, Solver
+from diffabs.loop.batch import Batch
+from diffabs.parts.actuators import Delay
+from diffabs.parts.controllers import ConstantInput, NoFeedforward, Relay, SampledOnGrid, SlidingMode
 from diffabs.tune.result import build_subject_loop
 
 EQUAL_ROUNDING_STEPS = 64.0  # tolerance of equality, in units of the relative precision

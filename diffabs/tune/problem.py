@@ -24,11 +24,11 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import AnyArray, Array, Bool, Int, Part, PyTree, Scalar, Vector
-from diffabs.simulate.admissible import batch_admissibility, first_refusal
-from diffabs.simulate.batch import Batch
-from diffabs.simulate.drive.deferred import MANY_INPUTS_REASON, find_kernels
-from diffabs.simulate.ensemble import run_batch
-from diffabs.simulate.types import Run, Solver
+from diffabs.engine.admissible import batch_admissibility, first_refusal
+from diffabs.engine.drive.deferred import MANY_INPUTS_REASON, find_kernels
+from diffabs.engine.types import Run, Solver
+from diffabs.loop.batch import Batch
+from diffabs.loop.ensemble import run_batch
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.method import DerivativeMode
 from diffabs.tune.result import build_subject_loop

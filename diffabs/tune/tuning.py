@@ -14,12 +14,12 @@ from diffabs.core.pytree import canonical_dtypes, get, replace
 from diffabs.core.tracing import used_inputs
 from diffabs.core.types import Params, PyTree
 from diffabs.core.validity import check_part
-from diffabs.objectives import default_objectives
-from diffabs.runtime.interactive import ProgressLine, report_to
-from diffabs.simulate.arguments import refuse
-from diffabs.simulate.batch import Batch
-from diffabs.simulate.drive.engine import resolve_request
-from diffabs.simulate.types import Solver
+from diffabs.engine.arguments import refuse
+from diffabs.engine.drive.engine import resolve_request
+from diffabs.engine.types import Solver
+from diffabs.host.interactive import ProgressLine, report_to
+from diffabs.loop.batch import Batch
+from diffabs.parts.objectives import default_objectives
 from diffabs.tune import one_sided
 from diffabs.tune.augmented_lagrangian import AugmentedLagrangianSearch
 from diffabs.tune.constraints import Constraint

@@ -35,12 +35,12 @@ from diffabs.core.reason import Reason
 from diffabs.core.types import Part, PyTree
 from diffabs.core.units import units_of
 from diffabs.core.validity import check_part
-from diffabs.objectives import default_objectives
-from diffabs.simulate.admissible import first_refusal
-from diffabs.simulate.batch import Batch
-from diffabs.simulate.drive.engine import describe_engine
-from diffabs.simulate.ensemble import run_batch
-from diffabs.simulate.types import Run, Solver
+from diffabs.engine.admissible import first_refusal
+from diffabs.engine.drive.engine import describe_engine
+from diffabs.engine.types import Run, Solver
+from diffabs.loop.batch import Batch
+from diffabs.loop.ensemble import run_batch
+from diffabs.parts.objectives import default_objectives
 from diffabs.tune.descent import Descent, DescentState, lbfgs
 from diffabs.tune.method import DerivativeMode, Stopping
 from diffabs.tune.problem import Multipliers, Problem, choose_gradient_mode

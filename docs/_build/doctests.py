@@ -12,11 +12,22 @@ import griffe
 EXAMPLE = re.compile(r"(?:^>>> .*\n?)(?:^.+\n?)*", re.MULTILINE)
 SEE_ALSO = re.compile(r"^See also:\n((?:    `.*\n?)+)", re.MULTILINE)
 NAME = re.compile(r"`([\w.]+)`")
-spec = importlib.util.spec_from_file_location("parameters", pathlib.Path(__file__).with_name("parameters.py"))
-assert spec
-assert spec.loader
-parameters = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(parameters)
+
+
+def _beside(name: str) -> Any:
+    """Return the module beside this one: MkDocs loads each by its path."""
+    spec = importlib.util.spec_from_file_location(name, pathlib.Path(__file__).with_name(f"{name}.py"))
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+parameters = _beside("parameters")
+PACKAGE = pathlib.Path(__file__).parent.parent / "diffabs"
+# Where `design` of `design.certify` is.
+ROOMS = {init.parent.name: f"diffabs.{init.parts[-3]}.{init.parts[-2]}" for init in PACKAGE.glob("*/*/__init__.py")}
 
 
 def fenced(text: str) -> str:
@@ -43,9 +54,14 @@ def listed(text: str, names: set[str]) -> str:
 def linked(text: str) -> str:
     """Return a docstring whose section `See also:` is a list of links; its names are those below `diffabs`."""
 
+    def link(name: re.Match) -> str:
+        first, dot, rest = name[1].partition(".")
+        home = ROOMS.get(first, f"diffabs.{first}") if dot else f"diffabs.{first}"
+        return f"[{name[0]}][{home}{dot}{rest}]"
+
     def entry(line: str) -> str:
         names, _, rest = line.strip().partition(": ")
-        return f"    - {NAME.sub(lambda name: f'[{name[0]}][diffabs.{name[1]}]', names)}: {rest}\n"
+        return f"    - {NAME.sub(link, names)}: {rest}\n"
 
     return SEE_ALSO.sub(lambda found: "See also:\n" + "".join(map(entry, found[1].splitlines())), text)
 

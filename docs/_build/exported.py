@@ -27,8 +27,8 @@ def exported(package: str) -> dict[str, str]:
 
 
 def on_page_markdown(markdown: str, **given: Any) -> str:
-    """Return the page with the marks replaced. Names are those that users import: `diffabs.controllers.PID` has an
-    anchor."""
+    """Return the page with the marks replaced. Names are those that users import: `diffabs.parts.controllers.PID` has
+    an anchor."""
     del given
     return MARK.sub(lambda mark: _reference(mark[1]), markdown)
 

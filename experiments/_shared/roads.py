@@ -8,9 +8,10 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import qmc
 
-from diffabs import Batch, plot
-from diffabs.plants import GRAVITY
-from diffabs.roads import MagicFormula
+from diffabs import Batch
+from diffabs.output import plot
+from diffabs.parts.plants import GRAVITY
+from diffabs.parts.roads import MagicFormula
 
 
 @dataclasses.dataclass(frozen=True)

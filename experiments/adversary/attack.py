@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs import Batch, FixedStep, Loop, run_batch
-from diffabs.objectives import IAE, LockedTime, Overshoot
+from diffabs.parts.objectives import IAE, LockedTime, Overshoot
 from experiments.adversary.bounds import Bounds, drawn, parameters
 
 MEASURED = {"overshoot": Overshoot(), "locked": LockedTime(), "iae": IAE()}

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from diffabs import plot, replace, rollout
+from diffabs import replace, rollout
+from diffabs.output import plot
 from experiments.adversary.attack import Attack
 from experiments.adversary.bounds import NOISE, drawn, parameters
 from experiments.adversary.search import Log

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from diffabs import Loop
-from diffabs.controllers import BackCalculation, ProportionalFeedback, StateFeedback
 from diffabs.core.blocks import Series
 from diffabs.papers import lmi_design
-from diffabs.references import FilteredSlip, LimitedSlip
-from diffabs.roads import ScaledAlong
+from diffabs.parts.controllers import BackCalculation, ProportionalFeedback, StateFeedback
+from diffabs.parts.references import FilteredSlip, LimitedSlip
+from diffabs.parts.roads import ScaledAlong
+from diffabs.parts.sensors import DriftingSpeed, PlayedWheelNoise
 from diffabs.scenario.scenario import load
-from diffabs.sensors import DriftingSpeed, PlayedWheelNoise
 from experiments.adversary.bounds import Bounds
 from experiments.real_rig.box import KNOWN, Fixed
 from experiments.real_rig.loops import loop

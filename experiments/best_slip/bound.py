@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffabs.plants import GRAVITY, QuarterCar
+from diffabs.parts.plants import GRAVITY, QuarterCar
 from experiments._shared.roads import stiffness
 
 POINTS = 4000  # of the quadrature: 1e-7 of the distance

@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs import Batch, Loop
-from diffabs.controllers import PID, BackCalculation
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_memory
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Scalar
-from diffabs.plants import QuarterCar
-from diffabs.references import ExtremumSeeking, FixedSlip, PeakLatch, PeakRobust, SlipByDeceleration
-from diffabs.roads import MagicFormula, Patches
+from diffabs.parts.controllers import PID, BackCalculation
+from diffabs.parts.plants import QuarterCar
+from diffabs.parts.references import ExtremumSeeking, FixedSlip, PeakLatch, PeakRobust, SlipByDeceleration
+from diffabs.parts.roads import MagicFormula, Patches
+from diffabs.parts.sensors import IntegratedAccelerometer, Noise
+from diffabs.parts.stops import Standstill
 from diffabs.scenario.defaults import braking
-from diffabs.sensors import IntegratedAccelerometer, Noise
-from diffabs.stops import Standstill
 from experiments.best_slip.bound import INERTIA
 from experiments.best_slip.fixed import ERRORS, Fixed, Lanes
 

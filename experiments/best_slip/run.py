@@ -16,7 +16,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import Batch, FixedStep, Loop, plot, run_batch
+from diffabs import Batch, FixedStep, Loop, run_batch
+from diffabs.output import plot
 from diffabs.papers import record
 from experiments._shared.entry import with_times
 from experiments._shared.statistics import interval

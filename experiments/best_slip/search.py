@@ -14,7 +14,7 @@ import numpy as np
 
 from diffabs import FixedStep, Loop, run_batch
 from diffabs.core.bijectors import parameter_space
-from diffabs.objectives import LockedTime, StopDistance
+from diffabs.parts.objectives import LockedTime, StopDistance
 from diffabs.tune import Method, Stopping, Tuned, build_problem, tune
 from diffabs.tune.problem import Problem
 from experiments.best_slip.fixed import EXACT, Fixed, Lanes, lanes

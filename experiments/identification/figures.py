@@ -5,10 +5,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import plot
-from diffabs.identify.fit import Identified
+from diffabs.output import plot
 from diffabs.papers import slip_estimator
-from diffabs.roads import SPLINE_B, MagicFormula
+from diffabs.parts.roads import SPLINE_B, MagicFormula
+from diffabs.tune.identify.fit import Identified
 
 UNITS = ("s", "m")
 

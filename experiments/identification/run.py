@@ -21,20 +21,20 @@ import numpy as np
 from jax.tree_util import Partial
 
 from diffabs import FixedStep, Loop
-from diffabs.controllers import PID, ConstantTorque
 from diffabs.core.pytree import canonical_dtypes, param, pytree
 from diffabs.core.types import Scalar, Vector
-from diffabs.identify.fit import Identified, Tolerances
-from diffabs.identify.identification import identify
-from diffabs.identify.residuals import gaussian
-from diffabs.identify.table import Table
 from diffabs.papers import record, slip_estimator
-from diffabs.plants import QuarterCar
-from diffabs.references import FixedSlip, PeakLatch
-from diffabs.roads import MagicFormula, Tabulated
-from diffabs.roads.tabulated import PiecewiseCubic
+from diffabs.parts.controllers import PID, ConstantTorque
+from diffabs.parts.plants import QuarterCar
+from diffabs.parts.references import FixedSlip, PeakLatch
+from diffabs.parts.roads import MagicFormula, Tabulated
+from diffabs.parts.roads.tabulated import PiecewiseCubic
+from diffabs.parts.stops import Standstill
 from diffabs.scenario.defaults import braking
-from diffabs.stops import Standstill
+from diffabs.tune.identify.fit import Identified, Tolerances
+from diffabs.tune.identify.identification import identify
+from diffabs.tune.identify.residuals import gaussian
+from diffabs.tune.identify.table import Table
 from experiments.identification.figures import UNITS, draw_curves, draw_residuals
 
 PATHS = ("plant.inertia", "plant.road.B", "plant.road.C", "plant.road.D", "plant.road.E")

@@ -17,17 +17,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import BrakeStart, FixedStep, Loop, Run, plot, run_batch
-from diffabs.actuators import Lag
-from diffabs.controllers import ConstantTorque, HoldingInput, StateFeedback
-from diffabs.objectives import BRAKING
+from diffabs import BrakeStart, FixedStep, Loop, Run, run_batch
+from diffabs.loop.batch import stack_loops
+from diffabs.output import plot
 from diffabs.papers import record
-from diffabs.plants import GRAVITY, LabRig, MirroredRig
-from diffabs.plants.lab_rig import LabRigState
-from diffabs.references import FixedSlip
+from diffabs.parts.actuators import Lag
+from diffabs.parts.controllers import ConstantTorque, HoldingInput, StateFeedback
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.plants import GRAVITY, LabRig, MirroredRig
+from diffabs.parts.plants.lab_rig import LabRigState
+from diffabs.parts.references import FixedSlip
+from diffabs.parts.stops import SpeedReached
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.batch import stack_loops
-from diffabs.stops import SpeedReached
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,20 +18,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs import Batch, BrakeStart, FixedStep, Loop, plot
-from diffabs.actuators import Lag
-from diffabs.controllers import PID, BackCalculation, ConstantInput, HoldingInput, ScheduledFeedback, StateFeedback
+from diffabs import Batch, BrakeStart, FixedStep, Loop
 from diffabs.core.pytree import param, part, pytree, replace
 from diffabs.core.types import Vector
-from diffabs.design.parameter_box import polytope
 from diffabs.linear.regulator import lqr
 from diffabs.linear.slip_model import SlipModel
-from diffabs.objectives import BRAKING, Effort, QuadraticCost
-from diffabs.plants import MirroredRig, QuarterCar
-from diffabs.references import FilteredSlip, PeakRobust
-from diffabs.roads import MagicFormula
+from diffabs.output import plot
+from diffabs.parts.actuators import Lag
+from diffabs.parts.controllers import (
+    PID,
+    BackCalculation,
+    ConstantInput,
+    HoldingInput,
+    ScheduledFeedback,
+    StateFeedback,
+)
+from diffabs.parts.objectives import BRAKING, Effort, QuadraticCost
+from diffabs.parts.plants import MirroredRig, QuarterCar
+from diffabs.parts.references import FilteredSlip, PeakRobust
+from diffabs.parts.roads import MagicFormula
+from diffabs.parts.stops import SpeedReached, Standstill
+from diffabs.robust.design.parameter_box import polytope
 from diffabs.scenario.defaults import braking
-from diffabs.stops import SpeedReached, Standstill
 from diffabs.tune import Problem, build_problem, grid, latin
 from diffabs.tune.weights import lq_weights, lqr_gain_design, robust_gain_design
 

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from diffabs import plot
-from diffabs.controllers import StateFeedback
-from diffabs.design import Spec, certify, design
+from diffabs.output import plot
 from diffabs.papers import record
+from diffabs.parts.controllers import StateFeedback
+from diffabs.robust.design import Spec, certify, design
 from diffabs.tune import Method, Stopping, Tuned, tune
 from diffabs.tune.problem import Problem
 from diffabs.tune.weights import LQWeights

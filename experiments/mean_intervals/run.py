@@ -1,6 +1,6 @@
 """How often does a 95 % interval of a mean cover it, for skewed laws and few samples?
 
-The package reports the hull of Hall's and Student's intervals (`diffabs.sweep.statistics.estimates`). Each number is in
+The package reports the hull of Hall's and Student's intervals (`sweep.statistics.estimates`). Each number is in
 percent of 10,000 samples, with a standard error of at most 0.5. "warned" counts the samples that `diffabs sweep` calls
 skewed, by `MAX_SKEWNESS`. "length" is the median length over that of Student's interval.
 
@@ -14,8 +14,8 @@ import numpy as np
 from scipy import stats
 
 from diffabs.papers import record
-from diffabs.sweep.statistics import summary
-from diffabs.sweep.statistics.estimates import Moments
+from diffabs.uncertainty.sweep.statistics import summary
+from diffabs.uncertainty.sweep.statistics.estimates import Moments
 
 LAWS = {
     "log-normal, sigma 1.5": stats.lognorm(1.5),

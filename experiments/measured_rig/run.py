@@ -24,8 +24,14 @@ import jax
 import numpy as np
 
 from diffabs import Batch, FixedStep, Loop, measure, run_batch
-from diffabs.actuators import AsymmetricLag, DeadTime, Delay, Lag
-from diffabs.controllers import (
+from diffabs.core.blocks import Direct, Series
+from diffabs.core.protocols import Memory
+from diffabs.core.pytree import param, pytree, replace
+from diffabs.core.types import Scalar
+from diffabs.papers import lab_rig, measured_rig, record
+from diffabs.papers.measured_rig import MASK, Record, RecordedRun, compare_with_record, fit_record, with_values
+from diffabs.parts.actuators import AsymmetricLag, DeadTime, Delay, Lag
+from diffabs.parts.controllers import (
     PID,
     BackCalculation,
     Clamping,
@@ -34,21 +40,15 @@ from diffabs.controllers import (
     Sampled,
     StateFeedback,
 )
-from diffabs.core.blocks import Direct, Series
-from diffabs.core.protocols import Memory
-from diffabs.core.pytree import param, pytree, replace
-from diffabs.core.types import Scalar
-from diffabs.identify import Identified
-from diffabs.objectives import BRAKING
-from diffabs.papers import lab_rig, measured_rig, record
-from diffabs.papers.measured_rig import MASK, Record, RecordedRun, compare_with_record, fit_record, with_values
-from diffabs.plants import BrakeStart, LabRig, MirroredRig
-from diffabs.plants.lab_rig import LabRigState
-from diffabs.references import FilteredSlip, FixedSlip, LimitedSlip
-from diffabs.roads import Burckhardt
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.plants import BrakeStart, LabRig, MirroredRig
+from diffabs.parts.plants.lab_rig import LabRigState
+from diffabs.parts.references import FilteredSlip, FixedSlip, LimitedSlip
+from diffabs.parts.roads import Burckhardt
+from diffabs.parts.sensors import EncoderSlip
+from diffabs.parts.stops import SpeedReached
 from diffabs.scenario.defaults import braking
-from diffabs.sensors import EncoderSlip
-from diffabs.stops import SpeedReached
+from diffabs.tune.identify import Identified
 
 HALF = 1.5  # s; experiment 1 lasts 3 s
 # Ten starts: brakes (torque [N m], rate of the lag [1/s]) with two pairs of dead times each.

@@ -8,8 +8,9 @@ from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
-from diffabs import FixedStep, Loop, Run, plot, replace, rollout, run_batch
-from diffabs.objectives import BRAKING
+from diffabs import FixedStep, Loop, Run, replace, rollout, run_batch
+from diffabs.output import plot
+from diffabs.parts.objectives import BRAKING
 from diffabs.tune import Tuned, grid
 
 KMH = 3.6

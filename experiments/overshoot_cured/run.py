@@ -22,21 +22,21 @@ import jax
 import numpy as np
 
 from diffabs import Batch, BrakeStart, FixedStep, Loop, Run, replace, run_batch
-from diffabs.actuators import Lag
-from diffabs.controllers import ConstantInput, HoldingInput, ProportionalFeedback, Sampled, StateFeedback
 from diffabs.core.pytree import parameters
-from diffabs.design import Certificate, Polytope, Spec, certify, design
-from diffabs.design.parameter_box import polytope
-from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
-from diffabs.design.state_feedback import feedback_gain
 from diffabs.linear.slip_model import Sampling, SlipModel
-from diffabs.objectives import BRAKING
 from diffabs.papers import lmi_design, record
-from diffabs.plants import MirroredRig
-from diffabs.references import FilteredSlip, FixedSlip
+from diffabs.parts.actuators import Lag
+from diffabs.parts.controllers import ConstantInput, HoldingInput, ProportionalFeedback, Sampled, StateFeedback
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.plants import MirroredRig
+from diffabs.parts.references import FilteredSlip, FixedSlip
+from diffabs.parts.stops import SpeedReached
+from diffabs.robust.design import Certificate, Polytope, Spec, certify, design
+from diffabs.robust.design.parameter_box import polytope
+from diffabs.robust.design.speed_scaled import SpeedScaled, greatest_speed_fall
+from diffabs.robust.design.state_feedback import feedback_gain
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import load
-from diffabs.stops import SpeedReached
 from diffabs.tune import AtMost, CertifiedDecay, Method, Stopping, Tuned, build_problem, grid, tune
 from experiments._shared.statistics import kept
 from experiments.overshoot_cured.figures import figures

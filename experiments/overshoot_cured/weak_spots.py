@@ -14,11 +14,11 @@ import jax
 import numpy as np
 
 from diffabs import Batch, FixedStep, Loop, replace, rollout, run_batch
-from diffabs.actuators import Limits
 from diffabs.core.blocks import Series
 from diffabs.core.pytree import get
-from diffabs.objectives import Overshoot
-from diffabs.sensors import Noise, SpeedScale
+from diffabs.parts.actuators import Limits
+from diffabs.parts.objectives import Overshoot
+from diffabs.parts.sensors import Noise, SpeedScale
 
 KMH = 3.6
 OVERSHOOT = {"overshoot": Overshoot()}

@@ -22,16 +22,17 @@ import jax
 import numpy as np
 from scipy.stats import qmc
 
-from diffabs import Batch, FixedStep, Loop, measure, plot, replace, run_batch
-from diffabs.controllers import PID, BackCalculation
-from diffabs.objectives import BRAKING, Effort
+from diffabs import Batch, FixedStep, Loop, measure, replace, run_batch
+from diffabs.output import plot
 from diffabs.papers import record, slip_estimator
-from diffabs.plants import QuarterCar
-from diffabs.references import FixedSlip, PeakRobust
-from diffabs.roads import MagicFormula, Patches
+from diffabs.parts.controllers import PID, BackCalculation
+from diffabs.parts.objectives import BRAKING, Effort
+from diffabs.parts.plants import QuarterCar
+from diffabs.parts.references import FixedSlip, PeakRobust
+from diffabs.parts.roads import MagicFormula, Patches
+from diffabs.parts.sensors import Noise
+from diffabs.parts.stops import Standstill
 from diffabs.scenario.defaults import braking
-from diffabs.sensors import Noise
-from diffabs.stops import Standstill
 from diffabs.tune import Method, Stopping, Tuned, build_problem, tune
 from experiments._shared.roads import Family, Roads, family
 from experiments._shared.statistics import interval, kept

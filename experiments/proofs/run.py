@@ -22,11 +22,11 @@ import jax
 import numpy as np
 
 import diffabs as d
-from diffabs.objectives import SettlingTime
-from diffabs.reach import RunClaim, prove_box
-from diffabs.reach.engine import Prover
+from diffabs.parts.objectives import SettlingTime
+from diffabs.parts.sensors import Quantisation, SpeedScale
+from diffabs.robust.reach import RunClaim, prove_box
+from diffabs.robust.reach.engine import Prover
 from diffabs.scenario.scenario import load
-from diffabs.sensors import Quantisation, SpeedScale
 
 KMH = 3.6
 
@@ -142,7 +142,7 @@ def tube(config: Config) -> tuple[Any, Any]:
 
 def draw_tube(config: Config, bounds: Any, slips: Any) -> pathlib.Path:
     """Draw the tube over the runs, and return the file."""
-    from diffabs.plot.style import COLOURS, GREY, label_axes, save_figure, sheet
+    from diffabs.output.plot.style import COLOURS, GREY, label_axes, save_figure, sheet
 
     figure, axes = sheet(title="Published gain with torque limits: every mass 5.3 to 6.2 kg", size=(7.0, 3.6))
     times, least, greatest = bounds.T

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from diffabs import Batch
-from diffabs.roads import RIG
+from diffabs.parts.roads import RIG
 
 KMH = 3.6
 KNOWN, ESTIMATED = "known", "estimated"  # the vehicle's speed

@@ -6,7 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import FixedStep, Loop, plot, run_batch
+from diffabs import FixedStep, Loop, run_batch
+from diffabs.output import plot
 from experiments.real_rig.box import ESTIMATED, KNOWN, NOMINAL, Box, Fixed, batch, columns, drawn
 from experiments.real_rig.floor import floor
 from experiments.real_rig.judge import Judging, runs

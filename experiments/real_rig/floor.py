@@ -22,8 +22,8 @@ import numpy as np
 from diffabs.core.numerics import larger
 from diffabs.core.protocols import Memory, Segment
 from diffabs.core.pytree import pytree
-from diffabs.objectives.tracking import HeldValue
-from diffabs.roads import RIG
+from diffabs.parts.objectives.tracking import HeldValue
+from diffabs.parts.roads import RIG
 from experiments.real_rig.box import KMH, KNOWN, Fixed
 
 HELD = 0.25  # s, from which on every controller worth the name holds its target

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 
 from diffabs import Batch, FixedStep, Loop, run_batch
-from diffabs.objectives import IAE, LockedTime, Overshoot, SettlingTime, StopDistance
-from diffabs.roads import RIG
-from diffabs.sweep.statistics.estimates import Count
+from diffabs.parts.objectives import IAE, LockedTime, Overshoot, SettlingTime, StopDistance
+from diffabs.parts.roads import RIG
+from diffabs.uncertainty.sweep.statistics.estimates import Count
 from experiments.real_rig.box import ESTIMATED, KMH, KNOWN, NOMINAL, Box, Fixed, batch, columns, corners, drawn
 from experiments.real_rig.floor import GRAVITY, HELD, MIRRORED, Deviation, floor
 

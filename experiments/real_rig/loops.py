@@ -4,14 +4,14 @@ import dataclasses
 from typing import Any
 
 from diffabs import BrakeStart, Loop
-from diffabs.actuators import Lag
-from diffabs.controllers import ConstantInput, Sampled, SampledOnGrid
 from diffabs.core.blocks import Series
-from diffabs.plants import MirroredRig
-from diffabs.references import FixedSlip
+from diffabs.parts.actuators import Lag
+from diffabs.parts.controllers import ConstantInput, Sampled, SampledOnGrid
+from diffabs.parts.plants import MirroredRig
+from diffabs.parts.references import FixedSlip
+from diffabs.parts.sensors import Bias, DriftingSpeed, Noise, Quantisation, SpeedEstimator, WheelNoise
+from diffabs.parts.stops import SpeedReached
 from diffabs.scenario.defaults import braking
-from diffabs.sensors import Bias, DriftingSpeed, Noise, Quantisation, SpeedEstimator, WheelNoise
-from diffabs.stops import SpeedReached
 from experiments.real_rig.box import KMH, KNOWN, NOMINAL, Fixed
 
 

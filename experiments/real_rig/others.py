@@ -10,16 +10,16 @@ import numpy as np
 from scipy.optimize import minimize
 
 from diffabs import Loop, replace
-from diffabs.controllers import PID, BackCalculation, ProportionalFeedback, SlidingMode, StateFeedback
 from diffabs.core.bijectors import parameter_space
-from diffabs.design import Spec, design
-from diffabs.design.parameter_box import polytope
-from diffabs.design.spec import L2Gain
-from diffabs.design.synthesis import DesignError
 from diffabs.linear.slip_model import SlipModel
 from diffabs.papers import lmi_design
-from diffabs.references import FilteredSlip
-from diffabs.roads import RIG
+from diffabs.parts.controllers import PID, BackCalculation, ProportionalFeedback, SlidingMode, StateFeedback
+from diffabs.parts.references import FilteredSlip
+from diffabs.parts.roads import RIG
+from diffabs.robust.design import Spec, design
+from diffabs.robust.design.parameter_box import polytope
+from diffabs.robust.design.spec import L2Gain
+from diffabs.robust.design.synthesis import DesignError
 from diffabs.scenario.scenario import load
 from experiments.real_rig.box import INERTIA, KMH, Box, Fixed, spread
 from experiments.real_rig.floor import floor

@@ -25,14 +25,14 @@ from typing import Any
 import numpy as np
 
 from diffabs import Loop
-from diffabs.actuators import Lag
-from diffabs.controllers import PID, ProportionalFeedback, StateFeedback
-from diffabs.design import Polytope, certify
-from diffabs.design.parameter_box import polytope
-from diffabs.design.parameter_grid import grid_polytope
-from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
 from diffabs.linear.slip_model import Sampling, SlipModel
-from diffabs.roads import RIG
+from diffabs.parts.actuators import Lag
+from diffabs.parts.controllers import PID, ProportionalFeedback, StateFeedback
+from diffabs.parts.roads import RIG
+from diffabs.robust.design import Polytope, certify
+from diffabs.robust.design.parameter_box import polytope
+from diffabs.robust.design.parameter_grid import grid_polytope
+from diffabs.robust.design.speed_scaled import SpeedScaled, greatest_speed_fall
 from experiments.real_rig.box import INERTIA, KMH, Box, Fixed
 
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from diffabs import Batch, FixedStep, Loop
-from diffabs.controllers import BackCalculation, ProportionalFeedback
-from diffabs.objectives import IAE, Overshoot
-from diffabs.references import LimitedSlip
-from diffabs.sensors import SpeedEstimator
+from diffabs.parts.controllers import BackCalculation, ProportionalFeedback
+from diffabs.parts.objectives import IAE, Overshoot
+from diffabs.parts.references import LimitedSlip
+from diffabs.parts.sensors import SpeedEstimator
 from diffabs.tune import CVaR, DerivativeMode, Method, SmoothWorst, Stopping, Tuned, build_problem, tune
 from experiments.real_rig.box import ESTIMATED, KNOWN, Box, Fixed, batch, columns, spread
 from experiments.real_rig.floor import Deviation, floor, stopping_time

@@ -15,14 +15,14 @@ import jax
 import numpy as np
 
 from diffabs import Batch, FixedStep, run_batch
-from diffabs.controllers import PID
-from diffabs.objectives import BRAKING
 from diffabs.papers import record
-from diffabs.plants import GRAVITY, QuarterCar
-from diffabs.references import FixedSlip, PeakLatch
-from diffabs.roads import MagicFormula, Patches
+from diffabs.parts.controllers import PID
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.plants import GRAVITY, QuarterCar
+from diffabs.parts.references import FixedSlip, PeakLatch
+from diffabs.parts.roads import MagicFormula, Patches
+from diffabs.parts.stops import Standstill
 from diffabs.scenario.defaults import braking
-from diffabs.stops import Standstill
 from experiments.best_slip.bound import INERTIA, bound
 
 OWN = MagicFormula()

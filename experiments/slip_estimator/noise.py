@@ -22,17 +22,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import FixedStep, Loop, measure, plot, run_batch
-from diffabs.controllers import PID
-from diffabs.objectives import StopDistance
+from diffabs import FixedStep, Loop, measure, run_batch
+from diffabs.loop.batch import stack_loops
+from diffabs.output import plot
 from diffabs.papers import record
-from diffabs.plants import QuarterCar
-from diffabs.references import FixedSlip, PeakLatch, PeakRobust
-from diffabs.roads import MagicFormula
+from diffabs.parts.controllers import PID
+from diffabs.parts.objectives import StopDistance
+from diffabs.parts.plants import QuarterCar
+from diffabs.parts.references import FixedSlip, PeakLatch, PeakRobust
+from diffabs.parts.roads import MagicFormula
+from diffabs.parts.sensors import IntegratedAccelerometer, Noise
+from diffabs.parts.stops import Standstill
 from diffabs.scenario.defaults import braking
-from diffabs.sensors import IntegratedAccelerometer, Noise
-from diffabs.simulate.batch import stack_loops
-from diffabs.stops import Standstill
 
 
 @dataclasses.dataclass(frozen=True)

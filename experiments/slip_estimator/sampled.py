@@ -16,16 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from diffabs import FixedStep, Loop, Run, plot, run_batch
-from diffabs.controllers import PID, Sampled
-from diffabs.objectives import BRAKING
+from diffabs import FixedStep, Loop, Run, run_batch
+from diffabs.loop.batch import stack_loops
+from diffabs.output import plot
 from diffabs.papers import record
-from diffabs.plants import QuarterCar
-from diffabs.references import FixedSlip, PeakLatch
-from diffabs.roads import MagicFormula
+from diffabs.parts.controllers import PID, Sampled
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.plants import QuarterCar
+from diffabs.parts.references import FixedSlip, PeakLatch
+from diffabs.parts.roads import MagicFormula
+from diffabs.parts.stops import Standstill
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.batch import stack_loops
-from diffabs.stops import Standstill
 
 
 @dataclasses.dataclass(frozen=True)

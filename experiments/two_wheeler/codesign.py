@@ -31,17 +31,18 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from diffabs import Batch, FixedStep, Loop, plot
+from diffabs import Batch, FixedStep, Loop
 from diffabs.core.pytree import replace
-from diffabs.design import certify
-from diffabs.design.attraction import Reach, largest_recovered_multiples
-from diffabs.design.parameter_grid import grid_polytope
+from diffabs.engine.run import rollout
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import recoverable_bound
-from diffabs.objectives import BALANCE, SoftLoss
+from diffabs.output import plot
 from diffabs.papers import record
+from diffabs.parts.objectives import BALANCE, SoftLoss
+from diffabs.robust.design import certify
+from diffabs.robust.design.attraction import Reach, largest_recovered_multiples
+from diffabs.robust.design.parameter_grid import grid_polytope
 from diffabs.scenario.scenario import load
-from diffabs.simulate.run import rollout
 from diffabs.tune import Method, Stopping, build_problem, tune
 from experiments.two_wheeler import random_designs
 from experiments.two_wheeler.machine import CLEAR, Machine

@@ -17,13 +17,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import Batch, FixedStep, plot, run_batch
+from diffabs import Batch, FixedStep, run_batch
 from diffabs.core.loop import Loop
 from diffabs.linear.gaussian import lqg
-from diffabs.objectives import SoftLoss
+from diffabs.output import plot
 from diffabs.papers import record
+from diffabs.parts.objectives import SoftLoss
+from diffabs.parts.sensors import AngleSensor
 from diffabs.scenario.scenario import load
-from diffabs.sensors import AngleSensor
 
 WEIGHTS, EFFORT = np.diag([1.0, 100.0, 1.0, 1.0, 1.0, 1.0]), 0.01
 FRAME = SoftLoss(weight=np.eye(6)[0], radius=1.0, softness=1.0)  # |theta|/(1 + |theta|): rises with the last lean

@@ -9,7 +9,7 @@ from diffabs.core.pytree import param, part, pytree, replace, static
 from diffabs.core.types import Scalar, Vector
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.regulator import lqr
-from diffabs.plants import ArmBalance
+from diffabs.parts.plants import ArmBalance
 
 CLEAR = 0.05  # m, between the hanging arm and the ground
 ROTOR = 2e-4  # kg m^2

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from diffabs import FixedStep, Loop
-from diffabs.design.attraction import classify_starts
+from diffabs.robust.design.attraction import classify_starts
 
 Values = dict[str, np.ndarray]  # by name, with a leading axis of designs
 

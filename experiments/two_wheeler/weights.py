@@ -17,15 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from diffabs import FixedStep, plot
+from diffabs import FixedStep
 from diffabs.core.pytree import replace
-from diffabs.design import certify
-from diffabs.design.attraction import Basin, Cells, recoverable_multiple, region_of_attraction
-from diffabs.design.parameter_grid import grid_polytope
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import mode_bounds
-from diffabs.objectives import SoftLoss
+from diffabs.output import plot
 from diffabs.papers import record
+from diffabs.parts.objectives import SoftLoss
+from diffabs.robust.design import certify
+from diffabs.robust.design.attraction import Basin, Cells, recoverable_multiple, region_of_attraction
+from diffabs.robust.design.parameter_grid import grid_polytope
 from diffabs.scenario.scenario import load
 from diffabs.tune import Method, Stopping, build_problem, grid, tune
 from diffabs.tune.weights import lq_weights, lqr_gain_design

@@ -15,17 +15,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import FixedStep, Loop, Run, measure, plot, replace, rollout, run_batch
-from diffabs.actuators import Lag
-from diffabs.controllers import StateFeedback
-from diffabs.design import Certificate, certify
-from diffabs.design.parameter_box import polytope
-from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
-from diffabs.design.state_feedback import feedback_gain
+from diffabs import FixedStep, Loop, Run, measure, replace, rollout, run_batch
 from diffabs.linear.slip_model import Sampling, SlipModel
-from diffabs.objectives import BRAKING
+from diffabs.output import plot
 from diffabs.papers import lmi_design, record
-from diffabs.references import FixedSlip
+from diffabs.parts.actuators import Lag
+from diffabs.parts.controllers import StateFeedback
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.references import FixedSlip
+from diffabs.robust.design import Certificate, certify
+from diffabs.robust.design.parameter_box import polytope
+from diffabs.robust.design.speed_scaled import SpeedScaled, greatest_speed_fall
+from diffabs.robust.design.state_feedback import feedback_gain
 from diffabs.scenario.scenario import load
 from diffabs.tune import WorstCase, grid, worst_case
 

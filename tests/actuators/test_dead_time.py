@@ -9,10 +9,10 @@ from mutants import killed_by
 from signals import Mean
 
 import diffabs as d
-from diffabs.actuators import AsymmetricLag, DeadTime, Lag
-from diffabs.controllers import PlayedCommand
 from diffabs.core.blocks import Series
 from diffabs.core.protocols import Memory
+from diffabs.parts.actuators import AsymmetricLag, DeadTime, Lag
+from diffabs.parts.controllers import PlayedCommand
 
 PERIOD, LENGTH = 0.01, 0.2
 PULSE = np.array([0.0, 3.0, 3.0, 0.0, 0.0, 0.0])  # 3 from 10 to 30 ms
@@ -24,14 +24,14 @@ def run_of(actuator, commands=PULSE, step=H, **solver):
 
 
 @pytest.mark.parametrize(("rise", "fall"), [(0.013, 0.0042), (0.0042, 0.013), (0.01, 0.01), (0.045, 0.052)])
-@killed_by("actuators/dead_time.py", "jnp.where(rises, self.rise, self.fall)", "self.rise")
+@killed_by("parts.actuators.dead_time", "jnp.where(rises, self.rise, self.fall)", "self.rise")
 def test_a_pulse_is_longer_or_shorter_by_the_difference(rise, fall):
     run = run_of(DeadTime(rise=rise, fall=fall))
     assert not run.diverged
     np.testing.assert_allclose(run.metrics["mean"][1], 3.0 * (0.02 + fall - rise) / LENGTH, rtol=1e-5)
 
 
-@killed_by("actuators/dead_time.py", "jnp.where(before, m.due, jnp.inf)", "m.due")
+@killed_by("parts.actuators.dead_time", "jnp.where(before, m.due, jnp.inf)", "m.due")
 def test_a_fall_that_would_come_first_cancels_the_pulse():
     assert run_of(DeadTime(rise=0.035, fall=0.01)).metrics["mean"][1] == 0
     two = run_of(DeadTime(rise=0.035, fall=0.01), [0.0, 1.0, 2.0, 0.0, 0.0, 0.0])  # the fall cancels both rises
@@ -40,7 +40,7 @@ def test_a_fall_that_would_come_first_cancels_the_pulse():
     np.testing.assert_allclose(run.metrics["mean"][1], 5.0 * (0.04 - 0.025) / LENGTH, rtol=1e-5)
 
 
-@killed_by("actuators/dead_time.py", "jnp.concatenate([m.due[1:]", "jnp.concatenate([m.due[:-1]")
+@killed_by("parts.actuators.dead_time", "jnp.concatenate([m.due[1:]", "jnp.concatenate([m.due[:-1]")
 def test_several_switches_are_on_their_way():
     commands = [0.0, 1.0, 0.0, 4.0, 2.0, 0.0]
     run = run_of(DeadTime(rise=0.061, fall=0.064), commands)
@@ -48,7 +48,7 @@ def test_several_switches_are_on_their_way():
     np.testing.assert_allclose(run.metrics["mean"][1], (expected - 0.0) / LENGTH, rtol=1e-5)
 
 
-@killed_by("core/validity.py", 'part, "plant", None)), "problems")', 'part, "plant", None)), "none")')
+@killed_by("core.validity", 'part, "plant", None)), "problems")', 'part, "plant", None)), "none")')
 @pytest.mark.parametrize(
     ("capacity", "message"),
     [
@@ -94,7 +94,7 @@ def test_adaptive_steps_and_a_lag_behind_it():
     np.testing.assert_allclose(run.metrics["mean"][1], 3.0 * (0.02 + 0.0042 - 0.0123) / LENGTH, rtol=1e-6)
 
 
-@killed_by("actuators/lag.py", "jnp.where(excess > 0, self.rise, self.fall)", "self.rise")
+@killed_by("parts.actuators.lag", "jnp.where(excess > 0, self.rise, self.fall)", "self.rise")
 def test_an_asymmetric_lag_is_two_exponentials():
     lag = AsymmetricLag(rise=0.02, fall=0.005)
     with jax.enable_x64(True):

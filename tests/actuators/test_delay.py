@@ -16,16 +16,16 @@ from mutants import killed_by
 from signals import Mean, close
 
 import diffabs as d
-from diffabs.actuators import Delay, Lag, Limits
-from diffabs.controllers import ConstantTorque, Relay, Sampled
 from diffabs.core.blocks import Series
 from diffabs.core.cubic import HermiteStep
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import canonical_dtypes, param, pytree
-from diffabs.objectives import TorqueRate
-from diffabs.references import Setpoint
-from diffabs.simulate.step.attempt import start_state
-from diffabs.simulate.step.system import build_system
+from diffabs.engine.step.attempt import start_state
+from diffabs.engine.step.system import build_system
+from diffabs.parts.actuators import Delay, Lag, Limits
+from diffabs.parts.controllers import ConstantTorque, Relay, Sampled
+from diffabs.parts.objectives import TorqueRate
+from diffabs.parts.references import Setpoint
 
 
 @pytree
@@ -65,7 +65,7 @@ def played(controller, actuator, steps, h=H, **solver):
 
 
 @pytest.mark.slow
-@killed_by("core/log.py", "if self.lent else rows", "if False else rows", case="1.0")
+@killed_by("core.log", "if self.lent else rows", "if False else rows", case="1.0")
 @pytest.mark.parametrize("back", [1.0, 2.0, 2.7, 5.5])
 def test_a_ramp_comes_later(back):
     """Exact at the instants and in the mean, from the very first moment."""
@@ -116,7 +116,7 @@ def test_converges_to_the_method_of_steps(kinks):
     assert np.log2(errors[0] / errors[-1]) / 3 > 2.7, errors
 
 
-@killed_by("actuators/delay.py", "jnp.where(at[0] <= 1.0, moves[0], 0.0)", "0.0 * moves[0]", case="jacfwd-0.0317")
+@killed_by("parts.actuators.delay", "jnp.where(at[0] <= 1.0, moves[0], 0.0)", "0.0 * moves[0]", case="jacfwd-0.0317")
 @pytest.mark.parametrize("late", [0.0317, pytest.param(0.03, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 @pytest.mark.slow
@@ -139,7 +139,7 @@ def test_derivatives_of_the_method_of_steps(late, derivative):
 # A command that jumps
 
 
-@killed_by("actuators/delay.py", "(m.window[i, -1] > 0.5)", "(m.window[i, -1] > 2.0)", case="0.0073-0.0026-False")
+@killed_by("parts.actuators.delay", "(m.window[i, -1] > 0.5)", "(m.window[i, -1] > 2.0)", case="0.0073-0.0026-False")
 @pytest.mark.parametrize("kinks", cases([False, True], False))
 @pytest.mark.parametrize(("first", "late"), [(7.3e-3, 2.6e-3), (7.3e-3, 2.7e-3), (7e-3, 2e-3), (7.3e-3, 1e-3)])
 def test_a_jump_comes_out_at_its_moment(first, late, kinks):
@@ -161,7 +161,7 @@ def slope_of_jump(derivative):
 
 
 @killed_by(
-    "actuators/delay.py",
+    "parts.actuators.delay",
     "_piece(m.window, last + 1).start,",
     "jax.lax.stop_gradient(_piece(m.window, last + 1).start),",
     case="0.0073-0.0026-jacfwd",
@@ -176,7 +176,7 @@ def test_the_moment_of_a_jump_is_differentiable(first, late, derivative):
 
 
 @killed_by(
-    "actuators/delay.py",
+    "parts.actuators.delay",
     "jnp.where(newest, 1.0, -1.0) * _time_tolerance(until + self.time)",
     "_time_tolerance(until + self.time)",
     case="0.002",
@@ -197,10 +197,10 @@ def test_what_a_computer_says_comes_out_later(late):
     close(jax.grad(mean)(late) * 15e-3, -levels[lengths > 1e-9][-1], rtol=1e-7)
 
 
-@killed_by("actuators/delay.py", "return jnp.any(jnp.stack(jumps))", "return jumps[0]", case="True")
-@killed_by("simulate/step/system.py", "(dynamics[:2], dynamics.signals.recorded)", "dynamics[:2]", case="True")
+@killed_by("parts.actuators.delay", "return jnp.any(jnp.stack(jumps))", "return jumps[0]", case="True")
+@killed_by("engine.step.system", "(dynamics[:2], dynamics.signals.recorded)", "dynamics[:2]", case="True")
 @killed_by(
-    "core/blocks.py",
+    "core.blocks",
     "            signal = block.output(t, m, signal)\n        return inputs\n\n    def record",
     "        return inputs\n\n    def record",
     case="True",
@@ -285,7 +285,7 @@ def stepped(delay, command, slope, lengths, jumps=()):
 
 @pytest.mark.slow
 @killed_by(
-    "actuators/delay.py",
+    "parts.actuators.delay",
     "_piece(m.window, last).end)",
     "_piece(m.window, last).end + jnp.where(m.valid == m.count, 0.0, 1.0))",
 )
@@ -322,7 +322,9 @@ def test_steps_of_any_length():
 
 
 @pytest.mark.slow
-@killed_by("actuators/delay.py", "window = jnp.where(count < size, rows, jnp.nan)", "window = rows", case="0.0009-True")
+@killed_by(
+    "parts.actuators.delay", "window = jnp.where(count < size, rows, jnp.nan)", "window = rows", case="0.0009-True"
+)
 @pytest.mark.parametrize(("every", "diverges"), [(4.1e-3, False), (0.9e-3, True)])
 def test_a_delay_that_has_no_room_has_no_value(every, diverges):
     """30 steps of delay in a ring of 32: commands that jump each fourth step fit, those that jump in each do not."""
@@ -345,7 +347,7 @@ def test_a_lag_behind_a_delay():
 
 
 @killed_by(
-    "actuators/delay.py",
+    "parts.actuators.delay",
     "return _count([m.window[i, 1] for i in range(WINDOW_PIECES)], t - self.time, m.place, m.last)",
     "return jnp.clip(jnp.sum(t - self.time >= m.window[:, 1]).astype(m.last.dtype), m.place, m.last)",
 )
@@ -363,7 +365,7 @@ def test_nobody_looks_for_the_ends_of_smooth_pieces():
     assert comparisons == [0]
 
 
-@killed_by("core/validity.py", 'part, "plant", None)), "problems")', 'part, "plant", None)), "none")')
+@killed_by("core.validity", 'part, "plant", None)), "problems")', 'part, "plant", None)), "none")')
 @pytest.mark.parametrize(
     ("capacity", "message"),
     [

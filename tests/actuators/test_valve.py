@@ -8,15 +8,15 @@ from mutants import killed_by
 from signals import Mean
 
 import diffabs as d
-from diffabs.actuators import IntegratingValve
-from diffabs.controllers import PlayedCommand
+from diffabs.parts.actuators import IntegratingValve
+from diffabs.parts.controllers import PlayedCommand
 
 LENGTH = 0.2
 
 
 @pytest.mark.slow
-@killed_by("actuators/valve.py", "smaller(rate, 0.0)", "rate")
-@killed_by("actuators/valve.py", "self.gain * signal", "signal")
+@killed_by("parts.actuators.valve", "smaller(rate, 0.0)", "rate")
+@killed_by("parts.actuators.valve", "self.gain * signal", "signal")
 def test_a_valve_waits_at_its_limits():
     """Up at 200/s to the limit 2 within 10 ms, where it stays; down from 60 ms on to the limit 0, and up again."""
     commands = [1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 0.0]

@@ -28,9 +28,9 @@ import diffabs
 from diffabs.cli import main, show
 from diffabs.core.protocols import Sample
 from diffabs.core.pytree import parameters
-from diffabs.objectives import BRAKING
+from diffabs.engine.stability import stable_step
+from diffabs.parts.objectives import BRAKING
 from diffabs.scenario import model, registry, scenario
-from diffabs.simulate.stability import stable_step
 
 SHORT = ("--set", "solver.duration=0.02", "--set", "solver.step=1e-3", "--set", "solver.every=1")
 
@@ -66,7 +66,7 @@ def whole(tmp_path_factory, runs):
             return Figure(f"{title}: {bool(run.stopped)}")
 
         plot = types.SimpleNamespace(draw_run=draw)
-        patch.setitem(sys.modules, "diffabs.plot", plot)
+        patch.setitem(sys.modules, "diffabs.output.plot", plot)
         result = run("simulate", "slip-lmi", "--json", "--csv", folder / "a.csv", "--plot", folder / "a.png")
     return folder, json.loads(result.stdout)
 
@@ -100,7 +100,7 @@ def test_metrics_are_the_reference_numbers(whole):
     assert metrics["locked_time"] == 0.0
 
 
-@killed_by("cli/show.py", 'csv.writer(file, lineterminator="\\n").writerow(columns)', 'file.write(",".join(columns))')
+@killed_by("cli.show", 'csv.writer(file, lineterminator="\\n").writerow(columns)', 'file.write(",".join(columns))')
 def test_a_unit_with_a_comma_is_one_column(tmp_path):
     unit, numbers = 'deg, of the "wheel"', np.arange(2.0)
     plant, shows = types.SimpleNamespace(control_unit="V"), collections.namedtuple("Output", ["angle"])
@@ -254,7 +254,7 @@ def test_failure_at_the_end_leaves_old_files_as_they_were(tmp_path, monkeypatch,
     def full(run, **_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(draw_run=full))
+    monkeypatch.setitem(sys.modules, "diffabs.output.plot", types.SimpleNamespace(draw_run=full))
     (tmp_path / "a.csv").write_text("old")
     files = ("--csv", tmp_path / "a.csv", "--plot", tmp_path / "a.png")
     result = run("simulate", "slip-lmi", *files, status=1)
@@ -301,7 +301,7 @@ def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
         titles.append(title)
         return Figure(title)
 
-    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(draw_run=draw))
+    monkeypatch.setitem(sys.modules, "diffabs.output.plot", types.SimpleNamespace(draw_run=draw))
     replace_seam(monkeypatch, "main_run", lambda chosen, key, keep: runs[0])
     gain = ("--set", "controller.gain=-4000,-40")
     tables = [run("simulate", "slip-lmi", *more, "--plot", tmp_path / "a.png").stdout for more in ((), gain)]
@@ -317,7 +317,7 @@ def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
 
 def test_a_long_title_stays_on_its_figure():
     pytest.importorskip("matplotlib")
-    from diffabs.plot import sheet
+    from diffabs.output.plot import sheet
 
     figure, _ = sheet(2, 2, title=f"slip-lmi with {', '.join(f'plant.mass={n}' for n in range(300))}")
     figure.draw_without_rendering()
@@ -376,7 +376,7 @@ def test_a_removed_entry_is_a_note():
     assert run("show", "slip-lmi", *changes, "-q").stderr == ""
 
 
-@killed_by("cli/usage.py", "        console.escape_unencodable_output()\n", "")
+@killed_by("cli.usage", "        console.escape_unencodable_output()\n", "")
 def test_a_title_that_stdout_cannot_encode_is_escaped(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text("title = 'ブレーキ'", encoding="utf-8")
@@ -386,7 +386,7 @@ def test_a_title_that_stdout_cannot_encode_is_escaped(tmp_path):
 
 
 @killed_by(
-    "cli/console.py", "(error.filename is None or error.errno in files.DISK_ERRORS) and _is_output_refused()", "False"
+    "cli.console", "(error.filename is None or error.errno in files.DISK_ERRORS) and _is_output_refused()", "False"
 )
 def test_help_on_a_full_disk_is_one_error_line(monkeypatch, capsys):
     class Full(io.StringIO):
@@ -477,8 +477,8 @@ def test_control_c_ends_a_long_run_with_one_line(tmp_path):
 
 
 @pytest.mark.slow
-@killed_by("cli/export.py", "    if as_json:\n", "    if as_json and not file:\n")
-@killed_by("cli/export.py", '.rstrip("_")', "")
+@killed_by("cli.export", "    if as_json:\n", "    if as_json and not file:\n")
+@killed_by("cli.export", '.rstrip("_")', "")
 def test_what_export_writes_and_prints(tmp_path):
     """Both forms of a table hold the same numbers; a name without an ASCII letter gives one that is allowed."""
     result = run("export", "slip-cured", "--to", "table", "--json", "-o", tmp_path / "t.csv")
@@ -491,7 +491,7 @@ def test_what_export_writes_and_prints(tmp_path):
 
 
 @pytest.mark.slow
-@killed_by("cli/main.py", 'AT_LIMIT = "at a limit\\n"', 'AT_LIMIT = "at a limit"')
+@killed_by("cli.main", 'AT_LIMIT = "at a limit\\n"', 'AT_LIMIT = "at a limit"')
 def test_an_objective_may_have_the_name_of_the_share_at_a_limit():
     limits = ("--set", "controller.low=0", "--set", "controller.high=0.1")  # far below the demand
     found = json.loads(

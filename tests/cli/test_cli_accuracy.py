@@ -15,12 +15,12 @@ from sweeping import SCENARIO
 
 import diffabs as d
 from diffabs.core.protocols import Memory
+from diffabs.engine.types import Adaptive
+from diffabs.loop.checking import check_run_accuracy, describe_check, describe_loose_metrics
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import load, loads
-from diffabs.simulate.checking import check_run_accuracy, describe_check, describe_loose_metrics
-from diffabs.simulate.types import Adaptive
-from diffabs.sweep import Results, sweep
-from diffabs.sweep.checking import _choose_samples, accuracy_warnings, check_accuracy
+from diffabs.uncertainty.sweep import Results, sweep
+from diffabs.uncertainty.sweep.checking import _choose_samples, accuracy_warnings, check_accuracy
 
 RELAY = """
 plant = "mirrored-rig"
@@ -136,7 +136,7 @@ def test_lanes_that_are_no_result_are_not_drawn():
     assert len(_choose_samples(study, table, 2)) == 2
 
 
-@killed_by("simulate/checking.py", 'max(MIN_CHANGE * abs(row["value"]), ROUNDING)', 'MIN_CHANGE * abs(row["value"])')
+@killed_by("loop.checking", 'max(MIN_CHANGE * abs(row["value"]), ROUNDING)', 'MIN_CHANGE * abs(row["value"])')
 def test_no_order_of_rounding_is_not_said():
     row = {"value": 8.9e-16, "converges": False, "error": 1.7e-14}
     found = {"reasons": [], "comparable": True, "ended alike": True, "turned": [], "metrics": {"final_slip_error": row}}
@@ -198,8 +198,8 @@ jax.tree_util.register_dataclass(EndlessSteps, [], ["most"])
 
 
 @pytest.mark.slow
-@killed_by("simulate/accuracy.py", "jnp.stack([coarse, half, quarter])", "jnp.stack([coarse, half])", case="quarter")
-@killed_by("simulate/accuracy.py", "jnp.any(finite) & ~jnp.all(finite)", "jnp.any(finite)")
+@killed_by("loop.accuracy", "jnp.stack([coarse, half, quarter])", "jnp.stack([coarse, half])", case="quarter")
+@killed_by("loop.accuracy", "jnp.any(finite) & ~jnp.all(finite)", "jnp.any(finite)")
 @pytest.mark.parametrize(("most", "turned"), [(9, []), (10, ["steps"]), (20, ["steps"]), (40, [])], ids=TURNS)
 def test_a_shorter_step_that_turns_a_number_into_never(file, most, turned):
     """Ten steps become twenty, and forty."""
@@ -213,8 +213,8 @@ def test_a_shorter_step_that_turns_a_number_into_never(file, most, turned):
     assert [said in lines] == [bool(turned)]
 
 
-@killed_by("simulate/checking.py", "if differs_in_kind(value, finer_value):", "if False:")
-@killed_by("simulate/types.py", "~(np.isnan(first) & np.isnan(second))", "True", case="both NaN")
+@killed_by("loop.checking", "if differs_in_kind(value, finer_value):", "if False:")
+@killed_by("engine.types", "~(np.isnan(first) & np.isnan(second))", "True", case="both NaN")
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("one", "other", "words"), PAIRS.values(), ids=PAIRS)
 def test_a_change_to_never_is_the_largest_of_rtol(one, other, words):
@@ -224,7 +224,7 @@ def test_a_change_to_never_is_the_largest_of_rtol(one, other, words):
     assert [line.partition("changes ")[2].partition(":")[0] for line in lines] == words
 
 
-@killed_by("simulate/checking.py", "    if finer.diverged:", "    if False:")
+@killed_by("loop.checking", "    if finer.diverged:", "    if False:")
 def test_a_closer_run_that_diverges_is_said():
     run: Any = SimpleNamespace(diverged=np.bool_(True), metrics={"iae": np.float64(np.nan)})
     lines = describe_loose_metrics({"iae": np.float64(0.3)}, Adaptive(rtol=1.6e-4), lambda finer: run)

@@ -10,13 +10,13 @@ from commands import assert_one_error_line, run
 from mutants import killed_by
 
 from diffabs import FixedStep, stops
-from diffabs.objectives import BALANCE
+from diffabs.parts.objectives import BALANCE
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import load
-from diffabs.sweep import Space, Study, Uniform
-from diffabs.sweep.study import has_wrong_end
 from diffabs.tune import worst_case
 from diffabs.tune.tuning import build_problem
+from diffabs.uncertainty.sweep import Space, Study, Uniform
+from diffabs.uncertainty.sweep.study import has_wrong_end
 
 METRICS = {"settling_time", "peak_lean", "peak_arm_angle", "peak_voltage", "peak_torque", "final_norm", "fell"}
 SHORT = ("--set", "solver.duration=0.02")
@@ -118,7 +118,7 @@ def test_certify_disproves_the_gain_for_one_rider():
     assert "quadratic stability is disproved" in result.stderr
 
 
-@killed_by("sweep/study.py", "return np.asarray(stopped) != success", "return ~np.asarray(stopped)")
+@killed_by("uncertainty.sweep.study", "return np.asarray(stopped) != success", "return ~np.asarray(stopped)")
 def test_a_stop_that_is_a_fall_is_not_missed():
     stopped = np.array([True, False])
     np.testing.assert_array_equal(has_wrong_end(stopped, stops.Fallen.success), [True, False])

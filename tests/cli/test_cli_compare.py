@@ -12,7 +12,7 @@ from scipy.stats import t
 
 from diffabs.cli.compare import _compare_metrics
 from diffabs.cli.show_samples import show_comparison
-from diffabs.sweep import Results
+from diffabs.uncertainty.sweep import Results
 
 # one worker makes what these share
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("any_step_is_stable", "without_load")]
@@ -69,8 +69,8 @@ def test_a_comparison_is_sample_by_sample(swept):
     assert width == pytest.approx(2 * t.ppf(0.975, 23) * spread, rel=1e-9)
 
 
-@killed_by("cli/show_samples.py", 'if row["never"]:', "if False:")
-@killed_by("cli/show_samples.py", "that diverged or were refused", "that diverged")
+@killed_by("cli.show_samples", 'if row["never"]:', "if False:")
+@killed_by("cli.show_samples", "that diverged or were refused", "that diverged")
 def test_runs_that_never_reach_an_event_are_said(capsys):
     """Two of seven samples, and one was refused: the other four have statistics."""
     stop = np.array([1.0, np.inf, 2.0, 3.0, 1.5, 2.5, np.inf])
@@ -88,7 +88,7 @@ def test_runs_that_never_reach_an_event_are_said(capsys):
     assert "7 common samples, 1 left out that diverged or were refused" in " ".join(shown.out.split())
 
 
-@killed_by("cli/compare.py", "if len(before) >= FEWEST:", "if len(before) < FEWEST:")
+@killed_by("cli.compare", "if len(before) >= FEWEST:", "if len(before) < FEWEST:")
 def test_a_metric_of_few_runs_has_a_row(capsys):
     """Three of five samples reach the event in both sweeps, and every sample has the other metric."""
     stop = np.array([1.0, np.inf, 2.0, 3.0, 1.5])

@@ -12,7 +12,7 @@ from diffabs.compiler.passes import PASSES
 
 
 @pytest.mark.slow
-@killed_by("compiler/listing.py", "sum(node.level == level and", "sum(node.level >= level and")
+@killed_by("compiler.listing", "sum(node.level == level and", "sum(node.level >= level and")
 def test_the_numbers_of_operations():
     """Elimination computes no number that nothing reads, and a tangent with fewer operations than jvp gives."""
     result = json.loads(run("compile", "slip-lmi", "--json").stdout)
@@ -30,7 +30,7 @@ def test_the_numbers_of_operations():
 
 
 @pytest.mark.slow
-@killed_by("cli/compile.py", 'call = derivative if by or name == "jvp" else values', "call = values")
+@killed_by("cli.compile", 'call = derivative if by or name == "jvp" else values', "call = values")
 def test_a_program_is_shown_after_every_pass(tmp_path):
     texts = {name: run("compile", "slip-lmi", "--show", name).stdout for name in PASSES}
     assert len(set(texts.values())) == len(PASSES)

@@ -17,10 +17,10 @@ from seams import replace_seam
 from diffabs.cli import certificates
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Scalar
-from diffabs.design import Certificate, DesignError, findings
-from diffabs.design.frozen import analyse_frozen_loops
-from diffabs.design.sdp import solver
 from diffabs.linear.linearization import StateSpace
+from diffabs.robust.design import Certificate, DesignError, findings
+from diffabs.robust.design.frozen import analyse_frozen_loops
+from diffabs.robust.design.sdp import solver
 from diffabs.scenario.scenario import load
 
 CHECKER = ROOT / "tests" / "support" / "check_certificate.py"
@@ -154,7 +154,7 @@ def test_changes_reach_the_design():
     np.testing.assert_allclose(document["gain"], [-1000, -111], rtol=0.01)
 
 
-@killed_by("cli/show.py", "The guaranteed cost has a P of its own", "The guaranteed cost is this bound")
+@killed_by("cli.show", "The guaranteed cost has a P of its own", "The guaranteed cost is this bound")
 def test_table_for_people():
     result = run("design", "slip-lmi")
     assert "common Lyapunov" not in result.stdout
@@ -184,7 +184,7 @@ def infeasible(monkeypatch):
 
 
 @killed_by(
-    "cli/design.py",
+    "cli.design",
     "                    show.as_json(certificates.proof_document(setup, task, reason=str(error)))\n",
     "                    pass\n",
 )
@@ -286,8 +286,8 @@ def greatest_deceleration(speed):
     return (4316.4 * 0.3 + 0.856 * speed**2) / 440.0 + 0.01 * 9.81
 
 
-@killed_by("design/loop_task.py", "i = int(np.argmax(decelerations / speeds))", "i = 0")
-@killed_by("design/speed_scaled.py", "if not deceleration * period < speed:", "if False:")
+@killed_by("robust.design.loop_task", "i = int(np.argmax(decelerations / speeds))", "i = 0")
+@killed_by("robust.design.speed_scaled", "if not deceleration * period < speed:", "if False:")
 def test_the_relative_fall_counts_air_drag_at_every_speed(tmp_path):
     path = tmp_path / "vehicle.toml"
     path.write_text(VEHICLE)
@@ -300,7 +300,7 @@ def test_the_relative_fall_counts_air_drag_at_every_speed(tmp_path):
         certificates.build_proof_task(load(path))
 
 
-@killed_by("design/findings.py", "speeds_of_box(task.over, low)).max()", "speeds_of_box(task.over, low)).min()")
+@killed_by("robust.design.findings", "speeds_of_box(task.over, low)).max()", "speeds_of_box(task.over, low)).min()")
 @pytest.mark.slow
 def test_the_greatest_fall_is_at_one_end_of_the_speeds(tmp_path, monkeypatch):
     path = tmp_path / "vehicle.toml"
@@ -317,7 +317,7 @@ def test_the_greatest_fall_is_at_one_end_of_the_speeds(tmp_path, monkeypatch):
     np.testing.assert_allclose(found.fall, 1.01 * greatest_deceleration(55.0), rtol=1e-4)
 
 
-@killed_by("design/frozen.py", "int((rates > 0).sum())", "len(grid)")
+@killed_by("robust.design.frozen", "int((rates > 0).sum())", "len(grid)")
 def test_frozen_loops_are_counted_at_their_poles():
     """x'' = u, u = -a x - x' with a between -1 and 3: stable for a > 0, 4 of 17 points and the one at 0 are not."""
     found = analyse_frozen_loops([0.0, 0.0], Spring(), {"stiffness": (-1.0, 3.0)})
@@ -347,7 +347,7 @@ def test_where_two_vertices_refute_at_once(tmp_path):
     assert checked(tmp_path / "c.json").returncode == 0
 
 
-@killed_by("design/loop_task.py", "fastest=True", "fastest=False")
+@killed_by("robust.design.loop_task", "fastest=True", "fastest=False")
 def test_fastest_decay_and_least_cost_of_a_gain():
     document = json.loads(run("certify", "slip-lmi", "--gain=-11753,-158.17", "--json").stdout)
     assert document["trace_cost"] == pytest.approx(1847633.09, rel=1e-5)
@@ -356,8 +356,8 @@ def test_fastest_decay_and_least_cost_of_a_gain():
     assert document["reason"] is None
 
 
-@killed_by("cli/console.py", 'say(f"verdict: {line}")', 'say(f"error: {line}")')
-@killed_by("cli/console.py", '"warning:", "verdict:",', '"warning:",')
+@killed_by("cli.console", 'say(f"verdict: {line}")', 'say(f"error: {line}")')
+@killed_by("cli.console", '"warning:", "verdict:",', '"warning:",')
 def test_a_verdict_is_no_error():
     """The command did its work; the status lets a script stop, and -q silences no verdict."""
     (line,) = run("certify", "slip-lmi", "-q", "--gain=11753,158", status=1).stderr.splitlines()
@@ -365,8 +365,8 @@ def test_a_verdict_is_no_error():
     assert line.endswith("vertex 2 (plant.mass 6.2, speed 1.38889) is unstable even with fixed parameters")
 
 
-@killed_by("cli/design.py", "        if reason:\n            console.c", "        if False:\n            console.c")
-@killed_by("design/findings.py", '"damping": (spec.damping > 0,', '"damping": (False,')
+@killed_by("cli.design", "        if reason:\n            console.c", "        if False:\n            console.c")
+@killed_by("robust.design.findings", '"damping": (spec.damping > 0,', '"damping": (False,')
 @pytest.mark.parametrize(
     ("change", "said"),
     [("design.decay=500", "decay = 500 1/s is disproved"), ("design.damping=0.95", "damping = 0.95 is undecided")],
@@ -385,7 +385,7 @@ def test_specifications_that_are_proved():
     assert document["decay_rate"] > 50
 
 
-@killed_by("design/findings.py", '[] if stable else [f"quad', '[] if stable is not False else [f"quad')
+@killed_by("robust.design.findings", '[] if stable else [f"quad', '[] if stable is not False else [f"quad')
 def test_undecided_is_not_proved(tmp_path, monkeypatch):
     replace_seam(monkeypatch, "certify", lambda gain, polytope, *_, **__: Certificate(polytope, gain, ()))
     result = run("certify", "slip-lmi", "--json", "--out", tmp_path / "c.json", status=1)
@@ -407,7 +407,7 @@ def test_sampled_loop_behind_a_delay():
 
 
 @killed_by(
-    "design/loop_task.py",
+    "robust.design.loop_task",
     "    if not isinstance(controller, ProportionalFeedback) or not isinstance(reduced.model, SlipModel):",
     "    if True:",
 )
@@ -447,7 +447,7 @@ def test_failure_of_the_linear_algebra_is_not_bad_input(monkeypatch):
 
 
 @killed_by(
-    "cli/certificates.py",
+    "cli.certificates",
     '    except ModuleNotFoundError as error:\n        console.fail(" ".join(str(error).split()))\n',
     "",
 )
@@ -462,7 +462,7 @@ def test_without_the_extra(command, monkeypatch, no_polytope):
 
 @pytest.mark.slow
 @killed_by(
-    "sweep/distributions.py",
+    "uncertainty.sweep.distributions",
     "from numpy.typing import ArrayLike\n",
     "from numpy.typing import ArrayLike\nfrom scipy.special import ndtr as _\n",
 )

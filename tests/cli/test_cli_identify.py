@@ -11,14 +11,14 @@ from mutants import killed_by
 from seams import replace_seam
 from small_scenarios import IDENTIFY as SMALL
 
-import diffabs.identify.identification as library
+import diffabs.tune.identify.identification as library
 from diffabs.cli import identify as commands_identify
 from diffabs.core.protocols import BrakeOutput
-from diffabs.identify.fit import Identified
-from diffabs.identify.uncertainty import uncertainty
 from diffabs.scenario.measurements import read_measurements
 from diffabs.scenario.scenario import ScenarioError, load
 from diffabs.tune import Reason
+from diffabs.tune.identify.fit import Identified
+from diffabs.tune.identify.uncertainty import uncertainty
 
 KEYS = [
     *(
@@ -66,7 +66,7 @@ def small(file):
 # Readings
 
 
-@killed_by("scenario/measurements.py", "    for i in used:", "    for i in range(len(row)):")
+@killed_by("scenario.measurements", "    for i in used:", "    for i in range(len(row)):")
 def test_readings_are_what_is_in_the_file(csv):
     """The column of commands is not read, whatever it holds."""
     rows = (row[:-1] + cell for row, cell in zip(ROWS, ("nan", "", "-inf"), strict=True))
@@ -105,7 +105,7 @@ BAD_FILES = [
 ]
 
 
-@killed_by("scenario/measurements.py", "np.flatnonzero(np.diff(t) <= 0)", "np.flatnonzero(np.diff(t) < -1e9)")
+@killed_by("scenario.measurements", "np.flatnonzero(np.diff(t) <= 0)", "np.flatnonzero(np.diff(t) < -1e9)")
 @pytest.mark.parametrize(("lines", "needed"), BAD_FILES, ids=[readable_id(needed) for _, needed in BAD_FILES])
 def test_a_bad_file_is_one_line(csv, lines, needed):
     path = csv(*lines) if lines else csv("")
@@ -166,7 +166,7 @@ def test_the_arguments_reach_the_fit(small, csv, invented):
     assert asked["solver"].duration == pytest.approx(0.302)
 
 
-@killed_by("identify/noise.py", "max(residual_noise[name], noise_floors[name])", "spread[name]")
+@killed_by("tune.identify.noise", "max(residual_noise[name], noise_floors[name])", "spread[name]")
 def test_noise_that_is_not_known_is_taken_from_the_residuals(small, csv, invented):
     document = json.loads(run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, "--json").stdout)
     first, *others = (asked["data"].sigma for asked in invented)
@@ -245,7 +245,7 @@ def test_what_simulate_wrote_is_found_again(small, tmp_path):
 
 
 @pytest.mark.slow
-@killed_by("identify/noise.py", "[] if fit.ends else [fit.values]", "[fit.values]")
+@killed_by("tune.identify.noise", "[] if fit.ends else [fit.values]", "[fit.values]")
 def test_a_value_at_an_end_of_its_range_has_no_deviation(small, tmp_path):
     run("simulate", small, "--csv", tmp_path / "run.csv", "--set", "plant.mass=5")
     args = ("--data", tmp_path / "run.csv", "--column", "slip", "--free", "plant.mass=5.2:8")
@@ -306,8 +306,8 @@ def test_without_the_extra(small, csv, monkeypatch):
     assert 'pip install ".[tune]" in a clone' in result.stderr
 
 
-@killed_by("scenario/measurements.py", "if i not in unlimited}", "}")
-@killed_by("scenario/measurements.py", "        if used[j] not in unlimited:", "        if True:")
+@killed_by("scenario.measurements", "if i not in unlimited}", "}")
+@killed_by("scenario.measurements", "        if used[j] not in unlimited:", "        if True:")
 def test_a_limit_that_a_simulation_lacks_is_not_measured(csv):
     rows = ("t [s],psi [rad],current_max [A]", "0,0.1,inf", "0.1,0.2,inf")
     units = {"psi": "rad", "current_max": "A"}
@@ -320,8 +320,8 @@ def test_a_limit_that_a_simulation_lacks_is_not_measured(csv):
         read_measurements(csv("t [s],psi [rad]", "0,inf"), units)
 
 
-@killed_by("cli/identify.py", "        if name in readings.infinite:", "        if False:")
-@killed_by("cli/identify.py", "if readings.infinite and not names:", "if False:")
+@killed_by("cli.identify", "        if name in readings.infinite:", "        if False:")
+@killed_by("cli.identify", "if readings.infinite and not names:", "if False:")
 def test_a_column_that_is_left_out_is_named(csv, capsys):
     path, units = csv("t [s],psi [rad],current_max [A]", "0,0.1,inf", "0.1,0.2,inf"), {"psi": "rad", "current_max": "A"}
     found = commands_identify._compared_columns(path, None, units)

@@ -15,8 +15,8 @@ from seams import replace_seam
 import diffabs as d
 from diffabs.cli import catalogue
 from diffabs.compiler.runtime import toolchain
-from diffabs.objectives import BRAKING
 from diffabs.papers.digest import Digest
+from diffabs.parts.objectives import BRAKING
 from diffabs.scenario import registry
 
 # list
@@ -89,7 +89,7 @@ def papers(monkeypatch):
         good(folder, progress)
         raise KeyboardInterrupt
 
-    importlib.import_module("diffabs.report")  # before its papers are replaced
+    importlib.import_module("diffabs.output.report")  # before its papers are replaced
     found = {"slip-lmi": good, "slip-estimator": good}
     replace_seam(
         monkeypatch,
@@ -102,7 +102,7 @@ def papers(monkeypatch):
     return found, interrupted
 
 
-@killed_by("cli/reproduce.py", 'if name == "all" else None', "if False else None")
+@killed_by("cli.reproduce", 'if name == "all" else None', "if False else None")
 def test_reproduce_everything(papers, tmp_path):
     result = run("reproduce", "--out", tmp_path / "new" / "out")
     out = tmp_path / "new" / "out"
@@ -119,14 +119,14 @@ def test_reproduce_everything(papers, tmp_path):
     assert os.stat(out / "slip-lmi").st_mode & 0o777 == 0o777 & ~umask()
 
 
-@killed_by("cli/reproduce.py", "            report.check_target(whole)\n", "            pass\n")
+@killed_by("cli.reproduce", "            report.check_target(whole)\n", "            pass\n")
 def test_a_foreign_report_is_found_before_any_paper(papers, tmp_path):
     (tmp_path / "report.html").write_text("a diary")
     assert_one_error_line(run("reproduce", "--out", tmp_path, status=2))
     assert left_in(tmp_path) == {"report.html"}
 
 
-@killed_by("cli/console.py", "except (ScenarioError, EngineError) as error:", "except ScenarioError as error:")
+@killed_by("cli.console", "except (ScenarioError, EngineError) as error:", "except ScenarioError as error:")
 def test_an_engine_that_cannot_make_the_runs_is_one_line(papers, tmp_path, monkeypatch):
     def needs_a_kernel(folder: pathlib.Path, progress) -> dict:
         lanes, solver = d.Batch({"plant.mass": [15.0]}), d.FixedStep(1e-3, 0.01)
@@ -203,7 +203,7 @@ def test_reproduce_leaves_other_peoples_folders_alone(papers, tmp_path):
     assert_one_error_line(run("reproduce", "slip-lmi", "--out", tmp_path / "slip-lmi" / "thesis.tex", status=2))
 
 
-@killed_by("cli/targets.py", 'not entries & {"manifest.json", "chunks"}', "True")
+@killed_by("cli.targets", 'not entries & {"manifest.json", "chunks"}', "True")
 @pytest.mark.parametrize("sweeps", ["manifest.json", "chunks"])
 def test_reproduce_leaves_a_sweep_alone(papers, tmp_path, sweeps):
     (tmp_path / "slip-lmi" / sweeps).mkdir(parents=True)

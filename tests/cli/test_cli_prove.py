@@ -78,7 +78,7 @@ def test_a_false_claim_about_the_brake_is_refuted(brake: list[str | pathlib.Path
 
 
 @pytest.mark.slow
-@killed_by("reach/claims.py", "rounding = SLIP_ROUNDING *", "rounding = 0.0 *")
+@killed_by("robust.reach.claims", "rounding = SLIP_ROUNDING *", "rounding = 0.0 *")
 def test_a_bound_of_the_overshoot_is_never_rounded_up() -> None:
     """At a target of 0.2, some of these products are rounded up."""
     shares = [f"0.{i}" for i in range(83, 99)]
@@ -94,7 +94,7 @@ def test_a_bound_of_the_overshoot_is_never_rounded_up() -> None:
 LIMITED = [word for change in ("low=0", "high=9.03") for word in ("--set", f"controller.{change}")]
 
 
-@killed_by("reach/claims.py", 'if operation.name == "const"', "if operation.value is not None")
+@killed_by("robust.reach.claims", 'if operation.name == "const"', "if operation.value is not None")
 def test_an_overshoot_needs_one_target_for_all_runs() -> None:
     """With a target of 0.149 the slip of one run is 73 % above it, which is 72 % above 0.15."""
     over = ("--over", "reference.slip=0.149:0.15", "--claim", "overshoot=0.725")
@@ -103,7 +103,7 @@ def test_an_overshoot_needs_one_target_for_all_runs() -> None:
     )
 
 
-@killed_by("reach/claims.py", "bound * step\n", "bound * setpoint\n")
+@killed_by("robust.reach.claims", "bound * step\n", "bound * setpoint\n")
 @pytest.mark.parametrize(
     ("first", "target", "quantity", "bound"),
     [
@@ -163,14 +163,14 @@ def test_the_table_of_a_proof_has_units_and_no_negative_zero(capsys: pytest.Capt
     assert "-0" not in shown
 
 
-@killed_by("cli/prove.py", "low and math.nextafter", "math.nextafter")
+@killed_by("cli.prove", "low and math.nextafter", "math.nextafter")
 def test_a_single_value_zero_is_not_widened() -> None:
     words = ("--over", "plant.mass=5.5:5.5", "--over", "initial.slip=0:0", "--budget", "1")
     found = json.loads(run("prove", "slip-lmi", *LIMITED, *words, "--claim", "no_lock", "--json", status=1).stdout)
     assert found["over"]["initial.slip"] == [0.0, 0.0]
 
 
-@killed_by("cli/prove.py", "if worst and math.isfinite(high)", "if math.isfinite(high)")
+@killed_by("cli.prove", "if worst and math.isfinite(high)", "if math.isfinite(high)")
 def test_a_bound_around_zero_has_no_relative_looseness() -> None:
     empty = np.zeros((0, 1, 2))
     proof: Any = SimpleNamespace(
@@ -182,7 +182,7 @@ def test_a_bound_around_zero_has_no_relative_looseness() -> None:
     assert [one["bounds"]["greatest slip"]["looseness"] for one in found] == [None, pytest.approx(0.25)]
 
 
-@killed_by("cli/show.py", 'if result.get("complete", True) else', "if True else")
+@killed_by("cli.show", 'if result.get("complete", True) else', "if True else")
 @pytest.mark.parametrize(
     ("proved", "complete", "word"),
     [(True, True, "proved  "), (True, False, "not refuted  "), (False, False, "NOT PROVED  ")],

@@ -10,8 +10,8 @@ from mutants import killed_by
 from reports import Page
 from seams import replace_seam
 
-from diffabs.plot.proofs import ProofMap, draw_proof
-from diffabs.report import build_report, find_documents
+from diffabs.output.plot.proofs import ProofMap, draw_proof
+from diffabs.output.report import build_report, find_documents
 
 pytestmark = pytest.mark.usefixtures("native_prover")
 LIMITS = ["--set", "controller.low=0", "--set", "controller.high=9.03"]
@@ -44,7 +44,7 @@ def proved(native_prover: None, tmp_path_factory: pytest.TempPathFactory) -> Pro
 
 
 @pytest.mark.slow
-@killed_by("cli/prove.py", "sides[i].scale for i in axes", "1.0 for i in axes")
+@killed_by("cli.prove", "sides[i].scale for i in axes", "1.0 for i in axes")
 def test_a_map_has_the_units_of_the_command(proved: Proved) -> None:
     folder, shown = proved
     assert (folder / "map.png").stat().st_size > 10_000
@@ -57,8 +57,8 @@ def test_a_map_has_the_units_of_the_command(proved: Proved) -> None:
 
 
 @pytest.mark.slow
-@killed_by("report/proofs.py", "table_unit(units.get(path))", "''")
-@killed_by("report/proofs.py", 'if verdict == "proved" and "certificate" in files', "if False")
+@killed_by("output.report.proofs", "table_unit(units.get(path))", "''")
+@killed_by("output.report.proofs", 'if verdict == "proved" and "certificate" in files', "if False")
 def test_a_report_has_verdict_box_bounds_and_map(proved: Proved) -> None:
     (document,) = find_documents(proved.folder)
     page = Page(build_report([document]))

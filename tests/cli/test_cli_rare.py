@@ -17,12 +17,12 @@ from small_scenarios import RARE
 from sweeping import described
 
 from diffabs.cli.show_samples import show_rare_event
-from diffabs.reliability.failure import failure_probability
-from diffabs.report.documents import find_documents
-from diffabs.report.studies import rare_section
+from diffabs.loop.batch import Batch
+from diffabs.loop.ensemble import run_batch
+from diffabs.output.report.documents import find_documents
+from diffabs.output.report.studies import rare_section
 from diffabs.scenario.scenario import load
-from diffabs.simulate.batch import Batch
-from diffabs.simulate.ensemble import run_batch
+from diffabs.uncertainty.reliability.failure import failure_probability
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
@@ -60,9 +60,9 @@ def test_tables_for_a_person(scenario, runs, monkeypatch):
     assert re.search(r"initial\.speed +\S +\d", text)
 
 
-@killed_by("cli/show_samples.py", "'>' if row['strict'] else '>='", "'>='")
-@killed_by("cli/rare.py", "'>' if last.strict else '>='", "'>='")
-@killed_by("report/studies.py", '"above" if row.get("strict") else "at least"', '"at least"')
+@killed_by("cli.show_samples", "'>' if row['strict'] else '>='", "'>='")
+@killed_by("cli.rare", "'>' if last.strict else '>='", "'>='")
+@killed_by("output.report.studies", '"above" if row.get("strict") else "at least"', '"at least"')
 def test_a_level_at_the_bound_is_above_it(scenario, tmp_path, capsys, monkeypatch):
     interrupts = [KeyboardInterrupt()]
 
@@ -82,7 +82,7 @@ def test_a_level_at_the_bound_is_above_it(scenario, tmp_path, capsys, monkeypatc
     assert re.findall(r"│ \d +│ (>=? 1)", capsys.readouterr().out) == [">= 1", "> 1"]
 
 
-@killed_by("cli/show_samples.py", '"undecided" if math.isnan(probability) else ', "")
+@killed_by("cli.show_samples", '"undecided" if math.isnan(probability) else ', "")
 def test_without_a_failure_the_probability_is_undecided(scenario, monkeypatch):
     replace_seam(monkeypatch, "measure_metric", lambda study, metric, at: np.tanh(at["initial.speed"]))
     text = run("rare", scenario, "stop_distance=2.8", "--samples", 200, "--seed", 5)

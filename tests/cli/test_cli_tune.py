@@ -25,11 +25,11 @@ import diffabs.tune as library
 from diffabs.cli import certificates, console, progress
 from diffabs.cli import tune as commands_tune
 from diffabs.core.pytree import parameters, replace
-from diffabs.design.sdp import solver
+from diffabs.engine.run import measure
+from diffabs.robust.design.sdp import solver
 from diffabs.scenario import tuning
 from diffabs.scenario.proving import Proved
 from diffabs.scenario.scenario import load
-from diffabs.simulate.run import measure
 from diffabs.tune import DerivativeMode, Reason, StartError, Tuned
 
 KEYS = [
@@ -61,7 +61,7 @@ pytestmark = pytest.mark.usefixtures("any_step_is_stable")  # it has tests of it
 def quick():
     """No seconds for figures, which have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(sys.modules, "diffabs.plot.tuning", types.SimpleNamespace(draw_tuning=drawn))
+        patch.setitem(sys.modules, "diffabs.output.plot.tuning", types.SimpleNamespace(draw_tuning=drawn))
         yield
 
 
@@ -161,7 +161,7 @@ def test_json_has_what_scripts_rely_on(tuned):
 
 
 @pytest.mark.slow
-@killed_by("cli/tune.py", 'after = work.scenario.with_loop(tuned.loop, "tuned")', "after = work.scenario")
+@killed_by("cli.tune", 'after = work.scenario.with_loop(tuned.loop, "tuned")', "after = work.scenario")
 def test_the_tuned_scenario_simulates_to_the_reported_numbers(tuned):
     folder, document, _ = tuned
     before, after = load(folder / "small.toml"), load(folder / "out.toml")
@@ -337,7 +337,7 @@ def test_packaged_scenarios_can_be_tuned(name, invented):
 # What could not be done
 
 
-@killed_by("scenario/tuning.py", '"met": beyond <= 0', '"met": True')
+@killed_by("scenario.tuning", '"met": beyond <= 0', '"met": True')
 def test_a_constraint_that_is_not_met_could_not_be_done(small, invented, tmp_path):
     (tmp_path / "old.toml").write_text("old")
     out = ("--out", tmp_path / "old.toml", "--plot", tmp_path / "a.png")
@@ -355,7 +355,7 @@ def test_a_constraint_that_is_not_met_could_not_be_done(small, invented, tmp_pat
     assert (tmp_path / "old.toml").read_text() == "old"
 
 
-@killed_by("scenario/tuning.py", '"met": beyond <= 0', '"met": beyond <= 1e-3 * abs(bound)')
+@killed_by("scenario.tuning", '"met": beyond <= 0', '"met": beyond <= 1e-3 * abs(bound)')
 @pytest.mark.parametrize(("bound", "met"), [("0.2", True), ("0.19999999999999998", False), ("0.1999001", False)])
 def test_met_is_met_without_a_tolerance(small, invented, bound, met):
     """0.2 was reached. The float below it is not met, and the table says by how much."""
@@ -400,7 +400,7 @@ def test_what_the_packaged_cure_says_is_met_is_met(tmp_path, changes):
     assert (-poles.real / np.abs(poles)).min() >= after.tune.damping
 
 
-@killed_by("cli/tune.py", "    except StartError as error:", "    except KeyError as error:")
+@killed_by("cli.tune", "    except StartError as error:", "    except KeyError as error:")
 def test_no_start_that_can_be_used_could_not_be_done(small, monkeypatch):
     def none(*_, **__):
         raise StartError(f"{Reason.START.value}: 2 of 2 lanes diverge there")
@@ -482,7 +482,7 @@ def test_interrupted_while_it_certifies_it_shows_what_was_found(small, invented,
     assert (tmp_path / "out.toml").exists()
 
 
-@killed_by("cli/tune.py", '"met": False, "missed": None}', '"met": False}')
+@killed_by("cli.tune", '"met": False, "missed": None}', '"met": False}')
 def test_interrupted_while_it_certifies_what_is_asked_for(small, invented, tmp_path, monkeypatch):
     def interrupted(_):
         raise KeyboardInterrupt

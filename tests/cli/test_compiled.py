@@ -9,7 +9,7 @@ import jax
 import pytest
 from seams import replace_seam
 
-from diffabs.runtime import compilation_cache as compiled
+from diffabs.host import compilation_cache as compiled
 
 
 @pytest.fixture

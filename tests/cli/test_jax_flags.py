@@ -26,6 +26,6 @@ def flags():
         jax.config.update(flag, value)
 
 
-@killed_by("cli/main.py", 'jax.config.update(f"jax_{flag}", value)', "pass")
+@killed_by("cli.main", 'jax.config.update(f"jax_{flag}", value)', "pass")
 def test_a_command_runs_under_flags_for_debugging(file, flags):
     assert '"diverged": false' in run("simulate", file(TUNE), "--json").stdout

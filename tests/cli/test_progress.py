@@ -12,7 +12,7 @@ from seams import replace_seam
 
 from diffabs.cli import console, progress
 from diffabs.cli.progress import WorkProgress, WorkTiming
-from diffabs.runtime import stopwatch
+from diffabs.host import stopwatch
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def clock(monkeypatch):
     return now, watch
 
 
-@killed_by("runtime/stopwatch.py", "while self._spans and", "while False and")
+@killed_by("host.stopwatch", "while self._spans and", "while False and")
 def test_spans_that_overlap_count_once():
     watch = stopwatch.Stopwatch()
     for start, end in ((1.0, 2.0), (4.0, 5.0), (4.5, 6.0), (3.5, 7.0), (9.0, 10.0)):
@@ -35,7 +35,7 @@ def test_spans_that_overlap_count_once():
     assert watch.seconds(since=20.0) == 0.0
 
 
-@killed_by("runtime/stopwatch.py", "if event.startswith(COMPILE_EVENT):", "if False:")
+@killed_by("host.stopwatch", "if event.startswith(COMPILE_EVENT):", "if False:")
 def test_what_jax_compiles_is_counted():
     stopwatch.count_compilations()
     stopwatch.count_compilations()  # once is enough
@@ -56,7 +56,7 @@ def test_what_jax_compiles_is_counted():
     assert 0.049 <= stopwatch.compile_time_since(begun) - before <= most
 
 
-@killed_by("cli/progress.py", "spent = now - start - stopwatch.compile_time_since(start)", "spent = now - start")
+@killed_by("cli.progress", "spent = now - start - stopwatch.compile_time_since(start)", "spent = now - start")
 def test_what_is_left_does_not_count_compiling(clock):
     """30 s, of which 20 were compiling, for a tenth of the work: the rest takes 90 s, not 270."""
     now, watch = clock
@@ -69,7 +69,7 @@ def test_what_is_left_does_not_count_compiling(clock):
     assert pace.describe(WorkProgress("")) == " 30 s, 20 s of it compiling"
 
 
-@killed_by("cli/progress.py", "self.first = self.first or (now, far.amount)", "self.first = self.first or (now, 0.0)")
+@killed_by("cli.progress", "self.first = self.first or (now, far.amount)", "self.first = self.first or (now, 0.0)")
 def test_what_was_there_before_is_no_pace(clock):
     """A sweep that goes on: 50 of 100 were there; 10 more took 10 s."""
     now, _ = clock
@@ -89,7 +89,7 @@ def test_a_time_in_words(seconds, words):
 
 
 @pytest.mark.slow
-@killed_by("cli/progress.py", "if last_words != (last_words := words):", "if True:")
+@killed_by("cli.progress", "if last_words != (last_words := words):", "if True:")
 def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
     """Where nothing can be drawn over, in lines; those that only differ in time are not told again."""
     replace_seam(monkeypatch, "patience", 1.0)
@@ -107,7 +107,7 @@ def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
     assert re.fullmatch(r"working ... somewhere; \d+ s(, \d+ s of it compiling)?\n", said), said
 
 
-@killed_by("cli/console.py", '"of it compiling": round(compiling, 1)', '"of it compiling": 0.0')
+@killed_by("cli.console", '"of it compiling": round(compiling, 1)', '"of it compiling": 0.0')
 def test_documents_say_how_long_they_took():
     console.note_command(["list", "roads"])
     with stopwatch.count_as_compiling():
@@ -117,7 +117,7 @@ def test_documents_say_how_long_they_took():
     assert 0.1 <= made["of it compiling"] <= made["seconds"] <= 300.0
 
 
-@killed_by("cli/progress.py", "    if len(words) > room:\n", "    if False:\n")
+@killed_by("cli.progress", "    if len(words) > room:\n", "    if False:\n")
 @pytest.mark.parametrize(
     ("width", "line"),
     [

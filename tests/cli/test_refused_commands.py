@@ -316,29 +316,29 @@ REFUSALS = [
 
 
 @killed_by(
-    "cli/certificates.py", "    if len(values) != len(states):", "    if False:", case="certify slip-lmi --gain=1,2,3"
+    "cli.certificates", "    if len(values) != len(states):", "    if False:", case="certify slip-lmi --gain=1,2,3"
 )
-@killed_by("scenario/proving.py", ", reduced.model.period)", ")", case="certify slip-cured --set design.damping=")
+@killed_by("scenario.proving", ", reduced.model.period)", ")", case="certify slip-cured --set design.damping=")
 @killed_by(
-    "cli/targets.py",
+    "cli.targets",
     "if os.path.isfile(source) and",
     "if False and",
     case="design tune.toml --out tune.toml",
 )
 @killed_by(
-    "scenario/section_design.py",
+    "scenario.section_design",
     "            if path not in paths:",
     "            if False:",
     case="margins slip-lmi --set reference=setpoin",
 )
-@killed_by("cli/usage.py", "(Value error, )?", "", case="export slip-cured --to cc")
+@killed_by("cli.usage", "(Value error, )?", "", case="export slip-cured --to cc")
 @killed_by(
-    "scenario/section_tune.py",
+    "scenario.section_tune",
     "if self.samples and not self.over:",
     "if False:",
     case="tune tune.toml --set tune.samples=9 --se",
 )
-@killed_by("cli/rare.py", "if not math.isfinite(value):", "if False:", case="rare rare.toml overshoot=nan")
+@killed_by("cli.rare", "if not math.isfinite(value):", "if False:", case="rare rare.toml overshoot=nan")
 @pytest.mark.usefixtures("any_step_is_stable")
 @pytest.mark.parametrize(("command", "status", "needed"), REFUSALS, ids=[readable_id(row[0]) for row in REFUSALS])
 def test_a_refusal_is_one_line_and_leaves_nothing(command, status, needed, tmp_path, monkeypatch):
@@ -357,8 +357,8 @@ def test_a_refusal_is_one_line_and_leaves_nothing(command, status, needed, tmp_p
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == FILES
 
 
-@killed_by("cli/usage.py", 'options.get("engine", "auto")', '"auto"', case="tune")
-@killed_by("cli/usage.py", 'options.get("engine", "auto")', '"xla"', case="reproduce")
+@killed_by("cli.usage", 'options.get("engine", "auto")', '"auto"', case="tune")
+@killed_by("cli.usage", 'options.get("engine", "auto")', '"xla"', case="reproduce")
 @pytest.mark.parametrize(
     ("command", "needed"),
     [

@@ -9,8 +9,9 @@ from mutants import killed_by
 from seams import replace_seam
 from small_scenarios import TUNE
 
-from diffabs.cli import main, margins, tune, tuning_task
-from diffabs.design.proof.certificate import Certificate
+from diffabs.cli import main, margins, tune
+from diffabs.robust.design.proof.certificate import Certificate
+from diffabs.scenario.proving import without_certificate
 from diffabs.scenario.scenario import load
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
@@ -30,11 +31,11 @@ def shown(*words):
 @pytest.fixture
 def small(file, monkeypatch):
     replace_seam(monkeypatch, "tune_tune", invented.tuned)
-    replace_seam(monkeypatch, "certify_result", lambda _: tuning_task.without_certificate("not asked for"))
+    replace_seam(monkeypatch, "certify_result", lambda _: without_certificate("not asked for"))
     return file(TUNE)
 
 
-@killed_by("cli/console.py", "        show()\n        raise\n", "        raise\n")
+@killed_by("cli.console", "        show()\n        raise\n", "        raise\n")
 def test_a_tuning_that_cannot_be_drawn_is_written_and_shown(small, tmp_path, monkeypatch):
     monkeypatch.setattr(tune, "_draw", fill_disk)
     out, plot = tmp_path / "tuned.toml", tmp_path / "tuned.png"
@@ -52,7 +53,7 @@ def test_a_tuning_that_cannot_be_written_is_shown(small, tmp_path, monkeypatch):
     assert not (tmp_path / "tuned.toml").exists()
 
 
-@killed_by("cli/main.py", "with console.show_before_errors(lambda: _show(result, setup, as_json)):", "if True:")
+@killed_by("cli.main", "with console.show_before_errors(lambda: _show(result, setup, as_json)):", "if True:")
 def test_a_run_that_cannot_be_drawn_is_shown(file, tmp_path, monkeypatch):
     monkeypatch.setattr(main, "_draw", fill_disk)
     content = shown("simulate", file(TUNE), "--plot", tmp_path / "run.png")
@@ -60,7 +61,7 @@ def test_a_run_that_cannot_be_drawn_is_shown(file, tmp_path, monkeypatch):
     assert content["files"] == {}
 
 
-@killed_by("cli/margins.py", "with console.show_before_errors(show_result):", "if True:")
+@killed_by("cli.margins", "with console.show_before_errors(show_result):", "if True:")
 def test_margins_that_cannot_be_drawn_are_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(margins, "_draw", fill_disk)
     content = shown("margins", "slip-lmi", "--samples", "2", "--plot", tmp_path / "loop.png")
@@ -69,7 +70,7 @@ def test_margins_that_cannot_be_drawn_are_shown(tmp_path, monkeypatch):
 
 
 @killed_by(
-    "cli/design.py",
+    "cli.design",
     "with console.show_before_errors(lambda: _show(document(), task, as_json)):\n                    proof.save(file)",
     "proof.save(file)",
 )

@@ -14,7 +14,7 @@ from mutants import killed_by
 from project import ROOT
 from sweeping import PATIENCE, SCENARIO, chunks, command, started, until
 
-from diffabs.runtime import interrupt
+from diffabs.host import interrupt
 
 LONG = ("--samples", "640000")
 
@@ -72,8 +72,8 @@ def test_workers_end_with_their_sweep(file, room, times):
 LEAVING = """
 import pathlib, sys, time
 from diffabs.cli import console
-from diffabs.runtime import files
-from diffabs.runtime import interrupt
+from diffabs.host import files
+from diffabs.host import interrupt
 
 def work():
     with files.temporary_path(pathlib.Path(sys.argv[1]) / "half.tmp") as path:
@@ -91,7 +91,7 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.slow
-@killed_by("cli/console.py", "        files.remove_unfinished()\n", "", case="SIGTERM")
+@killed_by("cli.console", "        files.remove_unfinished()\n", "", case="SIGTERM")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
 def test_what_a_thread_was_writing_goes_with_it(tmp_path, number):
     with started(sys.executable, "-c", LEAVING, str(tmp_path)) as process:
@@ -138,7 +138,7 @@ os._exit(interrupt.exit_status())
 INTERRUPT = ROOT / "diffabs" / "runtime" / "interrupt.py"
 
 
-@killed_by("runtime/interrupt.py", "_answer_end(number, _leave)", "pass", case="SIGTERM")
+@killed_by("host.interrupt", "_answer_end(number, _leave)", "pass", case="SIGTERM")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
 def test_a_signal_during_the_imports(number):
     with started(sys.executable, "-c", EARLY, str(INTERRUPT)) as process:
@@ -147,7 +147,7 @@ def test_a_signal_during_the_imports(number):
         assert ended(process, status=128 + number) == ("", "interrupted\n")
 
 
-@killed_by("runtime/interrupt.py", "os.dup2(nowhere, stream)", "pass")
+@killed_by("host.interrupt", "os.dup2(nowhere, stream)", "pass")
 def test_what_is_written_to_a_closed_terminal_is_no_error():
     terminal, line = pty.openpty()
     command = [sys.executable, "-c", HUNG_UP, str(INTERRUPT)]
@@ -159,7 +159,7 @@ def test_what_is_written_to_a_closed_terminal_is_no_error():
         assert process.wait(timeout=PATIENCE) == 129
 
 
-@killed_by("runtime/interrupt.py", "in (signal.SIG_DFL, _leave):", "is not None:")
+@killed_by("host.interrupt", "in (signal.SIG_DFL, _leave):", "is not None:")
 def test_under_nohup_a_closed_terminal_is_nothing():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:

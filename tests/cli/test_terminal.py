@@ -20,7 +20,7 @@ from sweeping import SCENARIO, chunks, environment, tune_section
 from terminal import COLUMNS, SPINNER, Terminal, assert_fits, assert_orderly, words
 
 from diffabs.cli import console, tables
-from diffabs.runtime import interrupt
+from diffabs.host import interrupt
 
 TUNED = tune_section(200, 1.0)
 SPREAD = "sweep.over.initial.speed={ type = 'normal', mean = 8.3, deviation = 0.3, low = 7.2, high = 11.0 }"
@@ -205,8 +205,8 @@ def test_a_library_leaves_control_c_alone():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@killed_by("runtime/interrupt.py", "signal.SIG_IGN if is_child else _leave", "_leave", case="a child")
-@killed_by("runtime/interrupt.py", 'program.parts[-2:] == ("diffabs", "__main__.py")', "False", case="child of -m")
+@killed_by("host.interrupt", "signal.SIG_IGN if is_child else _leave", "_leave", case="a child")
+@killed_by("host.interrupt", 'program.parts[-2:] == ("diffabs", "__main__.py")', "False", case="child of -m")
 @pytest.mark.parametrize(
     ("program", "words", "answer"),
     [

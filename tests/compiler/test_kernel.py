@@ -25,14 +25,14 @@ from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxp
 from diffabs.compiler.pipeline import run_lanes
 from diffabs.compiler.runtime import cpu, library_cache, toolchain
 from diffabs.core.lanes import any_lane
-from diffabs.objectives import BRAKING
+from diffabs.engine.drive import kernel as native
+from diffabs.engine.drive.engine import ENGINE_VARIABLE, log_kernel, log_xla_reason
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.stops import SpeedReached
 from diffabs.scenario import section_sweep
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.drive import kernel as native
-from diffabs.simulate.drive.engine import ENGINE_VARIABLE, log_kernel, log_xla_reason
-from diffabs.stops import SpeedReached
-from diffabs.sweep import Local, SweepError, sweep
-from diffabs.sweep.selection import REMOTE_REASON, choose_study_engine
+from diffabs.uncertainty.sweep import Local, SweepError, sweep
+from diffabs.uncertainty.sweep.selection import REMOTE_REASON, choose_study_engine
 
 pytestmark = pytest.mark.xdist_group("kernel")  # one worker compiles what these share
 
@@ -91,8 +91,8 @@ class TestRuns:
         assert len(np.unique(expected.metrics["iae"])) == LANES - 1  # NaN once
         same(found, expected, rtol=1e-13, atol=1e-15)
 
-    @killed_by("simulate/ensemble.py", 'engine: str = "auto",', 'engine: str = "xla",')
-    @killed_by("simulate/drive/engine.py", "            log_kernel()\n", "")
+    @killed_by("loop.ensemble", 'engine: str = "auto",', 'engine: str = "xla",')
+    @killed_by("engine.drive.engine", "            log_kernel()\n", "")
     def test_are_made_by_default(self, runs, users_engine, caplog):
         log_kernel.cache_clear()
         with caplog.at_level(logging.INFO, "diffabs"):
@@ -158,9 +158,9 @@ class TestObjections:
         assert native.kernel_objection(LOOP, VALUES, SOLVER, MEASURED) is None
 
     @pytest.mark.slow
-    @killed_by("compiler/runtime/toolchain.py", "if configured is not None and not configured.strip():", "if False:")
-    @killed_by("simulate/drive/engine.py", "    log_xla_reason(why_not)\n", "")
-    @killed_by("simulate/drive/engine.py", "    _refused[structure] = why_not\n", "")
+    @killed_by("compiler.runtime.toolchain", "if configured is not None and not configured.strip():", "if False:")
+    @killed_by("engine.drive.engine", "    log_xla_reason(why_not)\n", "")
+    @killed_by("engine.drive.engine", "    _refused[structure] = why_not\n", "")
     def test_without_a_compiler(self, users_engine, monkeypatch, caplog):
         monkeypatch.setenv(toolchain.COMPILER, "")
         log_xla_reason.cache_clear()
@@ -178,7 +178,7 @@ class TestObjections:
         loop = d.replace(loop, {"plant.mass": 6.0})
         d.run_batch(loop, d.Batch(VALUES), SOLVER, {}, accepted=True)
 
-    @killed_by("compiler/runtime/toolchain.py", "            _check_loads(command)\n", "", case="false")
+    @killed_by("compiler.runtime.toolchain", "            _check_loads(command)\n", "", case="false")
     @pytest.mark.parametrize("command", ["false", "/no/such/compiler"])
     def test_of_a_compiler_that_does_not_work(self, command, monkeypatch, tmp_path):
         """In a cache of its own: a mutant that finds it working would leave that in the shared one."""
@@ -187,13 +187,13 @@ class TestObjections:
         with pytest.raises(toolchain.NoCompiler, match=command):
             toolchain.find_compiler()
 
-    @killed_by("simulate/drive/engine.py", "if engine not in REQUESTABLE_ENGINES:", "if False:")
+    @killed_by("engine.drive.engine", "if engine not in REQUESTABLE_ENGINES:", "if False:")
     def test_of_another_name(self):
         with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
             d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="gpu")
 
     @killed_by(
-        "simulate/ensemble.py",
+        "loop.ensemble",
         "why_not = TOGETHER_REASON if trajectories or together else",
         "why_not = TOGETHER_REASON if False else",
     )
@@ -212,16 +212,16 @@ class TestObjections:
         with pytest.raises(ValueError, match="a kernel has no reverse mode: forward mode"):
             jax.grad(iae)(-4000.0)
 
-    @killed_by("compiler/lower/control_flow.py", "or not _is_any_rule(eqn)", "")
+    @killed_by("compiler.lower.control_flow", "or not _is_any_rule(eqn)", "")
     @killed_by(
-        "compiler/lower/rules.py",
+        "compiler.lower.rules",
         "if name not in LOWERING_RULES:",
         'if name not in LOWERING_RULES and name != "while":',
     )
-    @killed_by("compiler/lower/control_flow.py", 'if p["length"] > MAX_UNROLLED_STEPS:', "if False:")
-    @killed_by("compiler/lower/indexing.py", "if count > MAX_COMPARED_ENTRIES:", "if False:")
-    @killed_by("compiler/lower/indexing.py", "if len(column) > MAX_COMPARED_ENTRIES and", "if False and")
-    @killed_by("compiler/lower/random.py", 'if str(aval.dtype) != "key<fry>":', "if False:")
+    @killed_by("compiler.lower.control_flow", 'if p["length"] > MAX_UNROLLED_STEPS:', "if False:")
+    @killed_by("compiler.lower.indexing", "if count > MAX_COMPARED_ENTRIES:", "if False:")
+    @killed_by("compiler.lower.indexing", "if len(column) > MAX_COMPARED_ENTRIES and", "if False and")
+    @killed_by("compiler.lower.random", 'if str(aval.dtype) != "key<fry>":', "if False:")
     @pytest.mark.parametrize(
         ("function", "line"),
         [
@@ -238,7 +238,7 @@ class TestObjections:
         with pytest.raises(Unsupported, match=line.replace("(", r"\(")):
             applied({"f": function}, np.ones(3))
 
-    @killed_by("core/tracing.py", "if len(groups) != 3 or", "if False and")
+    @killed_by("core.tracing", "if len(groups) != 3 or", "if False and")
     @pytest.mark.parametrize("structure", [None, (1, 1, 1), {}])
     def test_of_a_scan_whose_inputs_are_told_otherwise(self, structure):
         """As JAX 0.11 began to do: a still later one may do so again."""
@@ -249,7 +249,7 @@ class TestObjections:
         with pytest.raises(Unsupported, match="scan: its parameter ft_in is not known"):
             lower_jaxpr(Graph(), new, [], [constant_array(Graph(), 1.0)])
 
-    @killed_by("compiler/lower/rules.py", "sorted(set(eqn.params) - LOWERING_RULES[name].parameters)", "[]")
+    @killed_by("compiler.lower.rules", "sorted(set(eqn.params) - LOWERING_RULES[name].parameters)", "[]")
     def test_of_a_parameter_that_is_not_known(self):
         """A later JAX may say something with it."""
         jaxpr = jax.make_jaxpr(lambda x: jnp.exp(x))(1.0).jaxpr
@@ -262,7 +262,7 @@ class TestObjections:
 class TestSweep:
     SETTINGS = ("sweep.samples=40", "sweep.chunk=16", "solver.step=2e-3", "solver.duration=0.4", "stop.speed_kmh=40.0")
 
-    @killed_by("sweep/study.py", 'if self.engine == "kernel":', "if False:")
+    @killed_by("uncertainty.sweep.study", 'if self.engine == "kernel":', "if False:")
     @pytest.mark.slow
     def test_is_that_of_xla_and_says_what_made_it(self, tmp_path):
         """Another engine does not go on with it."""
@@ -280,8 +280,10 @@ class TestSweep:
         with pytest.raises(SweepError, match="engine"):
             sweep(dataclasses.replace(study, engine="xla"), tmp_path / "kernel", resume=True)
 
-    @killed_by("sweep/run.py", "choose_study_engine(study, out, resume=resume,", "choose_study_engine(study, out,")
-    @killed_by("sweep/selection.py", "if resume and (", "if False and (")
+    @killed_by(
+        "uncertainty.sweep.run", "choose_study_engine(study, out, resume=resume,", "choose_study_engine(study, out,"
+    )
+    @killed_by("uncertainty.sweep.selection", "if resume and (", "if False and (")
     @pytest.mark.slow
     def test_resumed_keeps_its_engine(self, users_engine, tmp_path, monkeypatch):
         """The manifest decides, also where the default engine would now be another one."""
@@ -301,14 +303,16 @@ class TestSweep:
         ]
         assert engines == [{"name": "kernel", **toolchain.describe_compiler()}, None]
 
-    @killed_by("sweep/selection.py", "if remote else describe_placement(())", "if False else describe_placement(())")
+    @killed_by(
+        "uncertainty.sweep.selection", "if remote else describe_placement(())", "if False else describe_placement(())"
+    )
     def test_of_other_machines_is_made_by_xla(self, users_engine, tmp_path):
         """Their compilers and processors are not known."""
         study = section_sweep.build_study(scenario.load("slip-lmi", self.SETTINGS))
         chosen, why = choose_study_engine(study, tmp_path, remote=True)
         assert (chosen.engine, why) == ("xla", REMOTE_REASON)
 
-    @killed_by("sweep/run.py", 'if study.engine != "xla" and', "if False and")
+    @killed_by("uncertainty.sweep.run", 'if study.engine != "xla" and', "if False and")
     def test_is_refused_before_anything_is_written(self, tmp_path, monkeypatch):
         monkeypatch.setenv(toolchain.COMPILER, "")
         native._run.clear_cache()
@@ -317,9 +321,9 @@ class TestSweep:
             sweep(dataclasses.replace(study, engine="kernel"), tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
-    @killed_by("cli/sweep.py", "study, engine=engine).check()", "study).check()", case="kernel-")
-    @killed_by("cli/sweep.py", '    if study.engine == "kernel" and (', "    if False and (", case="kernel-")
-    @killed_by("cli/sweep.py", "    if why:\n", "    if False:\n", case="auto-note: runs are made by XLA:")
+    @killed_by("cli.sweep", "study, engine=engine).check()", "study).check()", case="kernel-")
+    @killed_by("cli.sweep", '    if study.engine == "kernel" and (', "    if False and (", case="kernel-")
+    @killed_by("cli.sweep", "    if why:\n", "    if False:\n", case="auto-note: runs are made by XLA:")
     @pytest.mark.slow
     @pytest.mark.parametrize(("engine", "line"), [("auto", "note: runs are made by XLA:"), ("kernel", "")])
     def test_by_the_command(self, engine, line, users_engine, tmp_path, monkeypatch):
@@ -335,7 +339,7 @@ class TestSweep:
 
 class TestGraph:
     @killed_by(
-        "compiler/operations.py",
+        "compiler.operations",
         '"{0} - {1}", "{0} - {1}", "{0} - {1}")',
         '"{0} - {1}", "{0} - {1}", "{0} - {1}", True)',
     )
@@ -354,7 +358,7 @@ class TestGraph:
         assert graph.op("mul", x, graph.const(1.0)) is x
         assert graph.op("mul", x, graph.const(0.0)) is not graph.const(0.0)  # x may be infinite
 
-    @killed_by("compiler/ir.py", "if _is_factor(inverse) else", "if True else")
+    @killed_by("compiler.ir", "if _is_factor(inverse) else", "if True else")
     def test_a_divisor_of_before_the_step_is_inverted_there(self):
         graph = Graph()
         x, fixed, tiny = (
@@ -367,8 +371,8 @@ class TestGraph:
         assert graph.op("div", x, tiny).op == "div"  # its inverse is infinite
         assert graph.op("div", x, x).op == "div"
 
-    @killed_by("compiler/ir.py", 'a.level < UpdateLevel.STEP and b.op == "mul"', 'False and b.op == "mul"')
-    @killed_by("compiler/ir.py", " and _is_factor(product := graph", " and (product := graph")
+    @killed_by("compiler.ir", 'a.level < UpdateLevel.STEP and b.op == "mul"', 'False and b.op == "mul"')
+    @killed_by("compiler.ir", " and _is_factor(product := graph", " and (product := graph")
     def test_two_factors_of_before_the_step_are_one(self):
         graph = Graph()
         x, fixed = graph.input(float, UpdateLevel.STEP, 0), graph.input(float, UpdateLevel.UNIFORM, 1)
@@ -398,8 +402,8 @@ class TestCarry:
         return jax.device_get((jax.jit(native)(levels, carry), jax.jit(jax.vmap(known))(levels, carry)))
 
     @pytest.mark.slow
-    @killed_by("compiler/program.py", "pending += [nodes[i] for nodes in updates]", "pass")
-    @killed_by("compiler/program.py", "i in read else carried[i]", "True else carried[i]")
+    @killed_by("compiler.program", "pending += [nodes[i] for nodes in updates]", "pass")
+    @killed_by("compiler.program", "i in read else carried[i]", "True else carried[i]")
     def test_what_nothing_reads_stays_as_it_was(self):
         """The last number of these leads to none that is read; those before it lead to the fourth, one by one."""
 
@@ -414,8 +418,8 @@ class TestCarry:
         np.testing.assert_array_equal(found[4], carry[4])
 
     @pytest.mark.slow
-    @killed_by("compiler/emit/cpp.py", "gate.args[1] is number and ", "")
-    @killed_by("compiler/emit/cpp.py", "if r.id not in self.rare.stored:", "if True:")
+    @killed_by("compiler.emit.cpp", "gate.args[1] is number and ", "")
+    @killed_by("compiler.emit.cpp", "if r.id not in self.rare.stored:", "if True:")
     def test_of_a_rare_branch_is_right_with_and_without_it(self):
         """Numbers that only the branch changes: `seen` is read by every step, too, `kept` by the branch alone. The
         last one becomes another number without the branch."""
@@ -516,7 +520,7 @@ class TestLibrary:
         fifth = toolchain.build_library("fifth")
         assert set(tmp_path.glob("*.so")) == {first, fourth, fifth}
 
-    @killed_by("compiler/runtime/toolchain.py", "repr((compiler, CPP_FLAGS, _processor()))", "repr(compiler)")
+    @killed_by("compiler.runtime.toolchain", "repr((compiler, CPP_FLAGS, _processor()))", "repr(compiler)")
     @pytest.mark.parametrize("changed", ["CPP_FLAGS", "_processor"])
     def test_is_another_for_other_flags_and_processors(self, changed, tmp_path, monkeypatch):
         toolchain.find_compiler()
@@ -528,7 +532,7 @@ class TestLibrary:
         assert toolchain.build_library("one") != path
 
     @killed_by(
-        "compiler/runtime/toolchain.py",
+        "compiler.runtime.toolchain",
         '    except OSError as error:\n        raise NoCompiler(f"no kernel',
         '    except subprocess.TimeoutExpired as error:\n        raise NoCompiler(f"no kernel',
     )
@@ -538,9 +542,7 @@ class TestLibrary:
         with pytest.raises(toolchain.NoCompiler, match=r"no kernel in .*file.kernel: Not a directory"):
             toolchain.build_library(self.TEXT % 3)
 
-    @killed_by(
-        "compiler/runtime/cpu.py", "except (OSError, AttributeError) as error:", "except AttributeError as error:"
-    )
+    @killed_by("compiler.runtime.cpu", "except (OSError, AttributeError) as error:", "except AttributeError as error:")
     def test_that_is_none_cannot_be_loaded(self, tmp_path, monkeypatch):
         (tmp_path / "none.so").write_text("nothing")
         with pytest.raises(toolchain.NoCompiler, match=r"invalid ELF header|file too short|not a mach-o"):

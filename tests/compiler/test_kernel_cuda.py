@@ -26,8 +26,8 @@ from diffabs import scenario
 from diffabs.compiler.emit import cuda
 from diffabs.compiler.runtime import gpu, library_cache, nvrtc
 from diffabs.compiler.runtime.toolchain import NoCompiler
+from diffabs.engine.drive import kernel as native
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.drive import kernel as native
 
 pytestmark = pytest.mark.xdist_group("kernel cuda")
 ON_GPU = jax.default_backend() == "gpu"
@@ -166,7 +166,7 @@ class TestMachineCode:
 
 
 @killed_by(
-    "compiler/runtime/nvrtc.py",
+    "compiler.runtime.nvrtc",
     "repr((NVRTC_FLAGS, nvrtc_version(), architecture))",
     "repr((nvrtc_version(), architecture))",
 )
@@ -192,7 +192,7 @@ class TestObjections:
         with pytest.raises(NoCompiler, match="no CUDA compiler; the package nvidia-cuda-nvrtc"):
             nvrtc._load_nvrtc.__wrapped__()
 
-    @killed_by("compiler/runtime/gpu.py", 'if not capability.replace(".", "").isdigit():', "if False:")
+    @killed_by("compiler.runtime.gpu", 'if not capability.replace(".", "").isdigit():', "if False:")
     def test_of_a_gpu_of_another_make(self, monkeypatch):
         replace_seam(monkeypatch, "gpu_devices", lambda: [Home("gpu", "gfx942")])
         line = "kernels are for processors and NVIDIA's GPUs, not for gpu gfx942"
@@ -248,12 +248,12 @@ class TestDriver:
         on.start(code, arrays, 4096, count, Context(77))
         return on, code, arrays
 
-    @killed_by("compiler/runtime/gpu.py", "ctypes.c_int64(blocks * cuda.THREADS_PER_BLOCK)", "ctypes.c_int64(blocks)")
+    @killed_by("compiler.runtime.gpu", "ctypes.c_int64(blocks * cuda.THREADS_PER_BLOCK)", "ctypes.c_int64(blocks)")
     @killed_by(
-        "compiler/runtime/gpu.py", "cuda.THREADS_PER_BLOCK, context.stream, arrays", "cuda.THREADS_PER_BLOCK, 0, arrays"
+        "compiler.runtime.gpu", "cuda.THREADS_PER_BLOCK, context.stream, arrays", "cuda.THREADS_PER_BLOCK, 0, arrays"
     )
     @killed_by(
-        "compiler/runtime/gpu.py",
+        "compiler.runtime.gpu",
         "min(loaded.blocks, -(-count // cuda.THREADS_PER_BLOCK))",
         "-(-count // cuda.THREADS_PER_BLOCK)",
     )
@@ -276,7 +276,7 @@ class TestDriver:
         assert len(driver.launches) == 4
 
     @killed_by(
-        "compiler/runtime/gpu.py",
+        "compiler.runtime.gpu",
         '    finally:\n        _call_driver("cuCtxPop',
         '    except ZeroDivisionError:\n        _call_driver("cuCtxPop',
     )

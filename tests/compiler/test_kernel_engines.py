@@ -20,25 +20,26 @@ from mutants import killed_by
 from seams import replace_seam
 
 import diffabs as d
-from diffabs import actuators, controllers, plants, reliability, roads, scenario, stops, sweep, tune
+from diffabs import actuators, controllers, plants, roads, scenario, stops, sweep, tune
 from diffabs.compiler import pipeline
 from diffabs.compiler.runtime import library_cache, toolchain
 from diffabs.core.protocols import Memory, no_flow
 from diffabs.core.pytree import get, param, pytree
-from diffabs.design import attraction
-from diffabs.design.attraction import Cells, region_of_attraction
-from diffabs.objectives import IAE, StopTime
-from diffabs.scenario.defaults import braking
-from diffabs.simulate.drive import kernel as native
-from diffabs.simulate.drive.engine import (
+from diffabs.engine.drive import kernel as native
+from diffabs.engine.drive.engine import (
     ENGINE_VARIABLE,
     EngineError,
     log_own_choice,
     log_xla_reason,
     resolve_request,
 )
-from diffabs.simulate.drive.sharding import describe_placement, run_on_all_cores
+from diffabs.engine.drive.sharding import describe_placement, run_on_all_cores
+from diffabs.parts.objectives import IAE, StopTime
+from diffabs.robust.design import attraction
+from diffabs.robust.design.attraction import Cells, region_of_attraction
+from diffabs.scenario.defaults import braking
 from diffabs.tune.method import DerivativeMode
+from diffabs.uncertainty import reliability
 
 pytestmark = pytest.mark.xdist_group("kernel engines")
 
@@ -110,8 +111,8 @@ def no_compiler(monkeypatch):
 class TestDefault:
     """Nobody names an engine."""
 
-    @killed_by("simulate/drive/engine.py", "and (why_not or why_xla):", "and why_not:")
-    @killed_by("simulate/drive/engine.py", "log_own_choice(why_not or why_xla)", "log_xla_reason(why_not or why_xla)")
+    @killed_by("engine.drive.engine", "and (why_not or why_xla):", "and why_not:")
+    @killed_by("engine.drive.engine", "log_own_choice(why_not or why_xla)", "log_xla_reason(why_not or why_xla)")
     def test_trajectories_are_those_of_xla(self, users_engine, caplog):
         """With no warning, since a kernel makes none."""
         log_own_choice.cache_clear()
@@ -119,16 +120,16 @@ class TestDefault:
             d.run_batch(decay_loop(), d.Batch({"plant.rate": [1.0, 2.0]}), d.FixedStep(0.1, 0.2), trajectories=True)
         assert [record.levelname for record in caplog.records] == ["INFO"]
 
-    @killed_by("tune/tuning.py", 'engine: str = "auto",', 'engine: str = "xla",')
-    @killed_by("tune/worst.py", 'engine: str = "auto",', 'engine: str = "xla",')
-    @killed_by("design/attraction.py", 'engine: str = "auto",', 'engine: str = "xla",')
-    @killed_by("sweep/study.py", 'engine: str = "auto"', 'engine: str = "xla"')
+    @killed_by("tune.tuning", 'engine: str = "auto",', 'engine: str = "xla",')
+    @killed_by("tune.worst", 'engine: str = "auto",', 'engine: str = "xla",')
+    @killed_by("robust.design.attraction", 'engine: str = "auto",', 'engine: str = "xla",')
+    @killed_by("uncertainty.sweep.study", 'engine: str = "auto"', 'engine: str = "xla"')
     def test_is_the_same_everywhere(self):
         functions = [d.run_batch, tune.build_problem, tune.worst_case, sweep.Study]
         functions += [getattr(attraction, name) for name in STARTS]
         assert {inspect.signature(function).parameters["engine"].default for function in functions} == {"auto"}
 
-    @killed_by("simulate/drive/engine.py", "meant = os.environ.get(ENGINE_VARIABLE) or engine", "meant = engine")
+    @killed_by("engine.drive.engine", "meant = os.environ.get(ENGINE_VARIABLE) or engine", "meant = engine")
     def test_is_replaced_by_the_environment(self, monkeypatch):
         assert resolve_request("auto") == "xla"  # of these tests
         monkeypatch.setenv(ENGINE_VARIABLE, "kernel")
@@ -144,9 +145,9 @@ SEVERAL = """
 import jax
 import numpy as np
 import diffabs as d
-from diffabs.runtime.process import core_count
+from diffabs.host.process import core_count
 from diffabs.compiler.runtime.cpu import thread_count
-from diffabs.simulate.drive.sharding import describe_placement
+from diffabs.engine.drive.sharding import describe_placement
 
 assert jax.local_device_count() == 2
 print(thread_count() == core_count())
@@ -157,8 +158,8 @@ print(describe_placement(jax.device_put(np.zeros(4), jax.NamedSharding(mesh, jax
 
 
 @pytest.mark.slow
-@killed_by("compiler/runtime/cpu.py", "    return core_count()\n", "    return 1\n")
-@killed_by("simulate/drive/sharding.py", "if any(len(devices) > 1 for devices in places):", "if False:")
+@killed_by("compiler.runtime.cpu", "    return core_count()\n", "    return 1\n")
+@killed_by("engine.drive.sharding", "if any(len(devices) > 1 for devices in places):", "if False:")
 def test_several_devices_of_one_processor():
     """A kernel uses all cores. Runs that lie on several devices are left to XLA."""
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
@@ -167,8 +168,8 @@ def test_several_devices_of_one_processor():
     assert done.stdout.splitlines() == ["True", "''", "the runs lie on several devices"]
 
 
-@killed_by("simulate/drive/sharding.py", "- {default_platform()}", '- {"cpu"}')
-@killed_by("simulate/drive/sharding.py", ' or default_platform() != "cpu"', "")
+@killed_by("engine.drive.sharding", "- {default_platform()}", '- {"cpu"}')
+@killed_by("engine.drive.sharding", ' or default_platform() != "cpu"', "")
 def test_runs_on_a_gpu(monkeypatch):
     """A kernel can run them where JAX runs on a GPU by default, and they are not dealt to the processor's cores."""
     replace_seam(monkeypatch, "default_platform", lambda: "gpu")
@@ -210,25 +211,25 @@ class TestTune:
         found, expected = (jax.device_get(problem.evaluator(1.0)(z, none)) for problem in problems)
         np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-7, atol=1e-12)
 
-    @killed_by("simulate/drive/engine.py", "    if engine not in REQUESTABLE_ENGINES:", "    if False:")
+    @killed_by("engine.drive.engine", "    if engine not in REQUESTABLE_ENGINES:", "    if False:")
     def test_of_another_name(self):
         with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
             tune.tune(tune.build_problem(LOOP, **TUNED, engine="gpu"))
 
-    @killed_by("tune/problem.py", "self.measured, engine=self.engine)", "self.measured)")
+    @killed_by("tune.problem", "self.measured, engine=self.engine)", "self.measured)")
     @pytest.mark.slow
     def test_without_a_compiler(self, users_engine, no_compiler):
         with pytest.raises(EngineError, match=NONE):
             tune.tune(tune.build_problem(LOOP, **TUNED, engine="kernel"))
         assert tune.build_problem(LOOP, **TUNED).find_engine() == ("xla", NONE)
 
-    @killed_by("compiler/lower/rules.py", "error.method = error.method or _calling_method(eqn)", "pass")
+    @killed_by("compiler.lower.rules", "error.method = error.method or _calling_method(eqn)", "pass")
     def test_of_what_has_no_rule_names_the_part(self):
         why = r"engine = 'kernel' is not possible: sort: there is no rule for it \(in SortedTorque.tick\)"
         with pytest.raises(EngineError, match=why):
             tune.build_problem(braking(controller=SortedTorque()), **TUNED, engine="kernel").find_engine()
 
-    @killed_by("simulate/drive/kernel.py", "if rows.shape[1] > MAX_COMPARED_ENTRIES:", "if False:")
+    @killed_by("engine.drive.kernel", "if rows.shape[1] > MAX_COMPARED_ENTRIES:", "if False:")
     def test_of_a_long_past_names_the_part(self):
         why = r"engine = 'kernel' is not possible: log: of 1296 rows; 64 are the most \(in Delay.record\)"
         with pytest.raises(EngineError, match=why):
@@ -246,13 +247,13 @@ class TestTune:
         assert f"note: runs are made by XLA: {NONE}" in done.stderr
         assert json.loads(done.stdout)["engine"] == {"name": "xla"}
 
-    @killed_by("cli/engine.py", "        resolve_request(engine)\n    except", "        pass\n    except")
+    @killed_by("cli.engine", "        resolve_request(engine)\n    except", "        pass\n    except")
     @pytest.mark.parametrize("command", [("tune", "slip-lmi"), ("rare", "slip-lmi", "overshoot")])
     def test_another_engine_is_refused_by_the_command(self, command):
         assert "--engine gpu is unknown" in run(*command, "--engine", "gpu", status=2).stderr
 
 
-@killed_by("tune/worst.py", "accepted=True, engine=engine)", "accepted=True, engine='xla')")
+@killed_by("tune.worst", "accepted=True, engine=engine)", "accepted=True, engine='xla')")
 @pytest.mark.slow
 def test_the_worst_case_is_that_of_xla(users_engine, monkeypatch):
     """Screened without derivatives and ascended with them, both by a kernel."""
@@ -271,7 +272,7 @@ def test_the_worst_case_is_that_of_xla(users_engine, monkeypatch):
     assert {bool(made.tangents) for made in launches} == {False, True}
 
 
-@killed_by("simulate/drive/kernel.py", "STEPS_PER_EXCHANGE // STEPS_PER_BLOCK", "1")
+@killed_by("engine.drive.kernel", "STEPS_PER_EXCHANGE // STEPS_PER_BLOCK", "1")
 @pytest.mark.slow
 def test_a_map_of_starts_is_that_of_xla():
     """Runs that end inside of an ellipsoid, that fall, and that do neither; known at the same instant."""
@@ -299,7 +300,7 @@ class TestSweep:
 
 
 class TestRare:
-    @killed_by("reliability/failure.py", 'if engine == "auto":', "if False:", case="True")
+    @killed_by("uncertainty.reliability.failure", 'if engine == "auto":', "if False:", case="True")
     @pytest.mark.slow
     @pytest.mark.parametrize("gradients", [pytest.param(False, marks=pytest.mark.slow), True])
     def test_is_that_of_xla(self, users_engine, gradients):
@@ -313,7 +314,7 @@ class TestRare:
         assert found.evaluations == expected.evaluations
         assert found.gradients == expected.gradients
 
-    @killed_by("reliability/failure.py", ", engine=study.engine)", ")")
+    @killed_by("uncertainty.reliability.failure", ", engine=study.engine)", ")")
     @pytest.mark.slow
     def test_objection(self, no_compiler):
         assert reliability.failure.find_metric_objection(STUDY, "stop_time") == NONE

@@ -185,23 +185,23 @@ RULES = {
 @pytest.mark.slow
 @killed_by("compiler/native/lanes.h", "REALLY(mask_max)(x, R_MASK(cmpeq)(x, x), x, y)", "REALLY(max)(x, y)")
 @killed_by(
-    "compiler/operations.py", 'NEGATED = {"eq": "ne", "ne": "eq"}', 'NEGATED = {"eq": "ne", "ne": "eq", "lt": "le"}'
+    "compiler.operations", 'NEGATED = {"eq": "ne", "ne": "eq"}', 'NEGATED = {"eq": "ne", "ne": "eq", "lt": "le"}'
 )
-@killed_by("compiler/lower/elementwise.py", '"TO_NEAREST_EVEN"', '"NEVER"')
+@killed_by("compiler.lower.elementwise", '"TO_NEAREST_EVEN"', '"NEVER"')
 @killed_by(
-    "compiler/lower/elementwise.py", "graph.const(0, integer)), bits, reverse)", "graph.const(0, integer)), bits, bits)"
+    "compiler.lower.elementwise", "graph.const(0, integer)), bits, reverse)", "graph.const(0, integer)), bits, bits)"
 )
 @killed_by(
-    "compiler/lower/arrays.py",
+    "compiler.lower.arrays",
     'better = graph.op("or", graph.op(beyond, x, best), nan)',
     'better = graph.op("not", graph.op(beyond, best, x))',
 )
-@killed_by("compiler/lower/random.py", "for i in range(5):", "for i in range(4):")
-@killed_by("compiler/emit/cpp.py", "yield from self._fill_column(item, indent)", "pass")
-@killed_by("compiler/ir.py", "if value <= ends.min", "if value < -1e30")
-@killed_by("compiler/operations.py", "return x // y + ((x % y != 0)", "return x // y + ((x % y == 0)")
-@killed_by("compiler/lower/arrays.py", "padded[first : max(first, last)]", "padded[first:]")
-@killed_by("compiler/lower/elementwise.py", "x, 0, 0x33333333", "x, 0, 0x13333333")
+@killed_by("compiler.lower.random", "for i in range(5):", "for i in range(4):")
+@killed_by("compiler.emit.cpp", "yield from self._fill_column(item, indent)", "pass")
+@killed_by("compiler.ir", "if value <= ends.min", "if value < -1e30")
+@killed_by("compiler.operations", "return x // y + ((x % y != 0)", "return x // y + ((x % y == 0)")
+@killed_by("compiler.lower.arrays", "padded[first : max(first, last)]", "padded[first:]")
+@killed_by("compiler.lower.elementwise", "x, 0, 0x33333333", "x, 0, 0x13333333")
 def test_rules_are_those_of_jax():
     """Every rule in one kernel, NaN and infinite arguments among them."""
     rng = np.random.default_rng(5)
@@ -237,8 +237,8 @@ def _long(x):
 
 
 @pytest.mark.slow
-@killed_by("compiler/emit/cpp.py", "and x is not branch.condition\n", "\n")
-@killed_by("compiler/emit/cpp.py", "self.rare = program, shape, RareNumbers({}, {})", "_ = program, shape, 0")
+@killed_by("compiler.emit.cpp", "and x is not branch.condition\n", "\n")
+@killed_by("compiler.emit.cpp", "self.rare = program, shape, RareNumbers({}, {})", "_ = program, shape, 0")
 def test_a_conditional_may_ask_a_parameter_or_a_carried_truth():
     """The condition is known before a run, or the step reads it for nothing else."""
     x, flag, which = np.linspace(0.1, 0.9, 7), np.arange(7) % 2 == 0, np.arange(7) % 3.0

@@ -13,7 +13,7 @@ import diffabs as d
 from diffabs import scenario
 from diffabs.compiler.runtime import library_cache
 from diffabs.core.pytree import get
-from diffabs.objectives import default_objectives
+from diffabs.parts.objectives import default_objectives
 from diffabs.scenario.defaults import balancing, braking
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernel parts")]

@@ -9,7 +9,7 @@ import pytest
 from kernels import FOLDER
 
 from diffabs.compiler.runtime import library_cache
-from diffabs.simulate.drive.engine import ENGINE_VARIABLE
+from diffabs.engine.drive.engine import ENGINE_VARIABLE
 
 pytestmark = pytest.mark.xdist_group("kernel")
 
@@ -95,8 +95,8 @@ FORKED = """
 import os
 import diffabs as d
 from diffabs import scenario
-from diffabs.simulate.drive import engine
-from diffabs.simulate.drive import kernel as native
+from diffabs.engine.drive import engine
+from diffabs.engine.drive import kernel as native
 
 def in_a_child(task):
     if child := os.fork():

@@ -29,7 +29,7 @@ from diffabs.compiler.ir import UpdateLevel
 from diffabs.compiler.pipeline import run_lanes
 from diffabs.compiler.runtime import library_cache
 from diffabs.core.pytree import get, parameters, stack_lists
-from diffabs.objectives import IAE, default_objectives
+from diffabs.parts.objectives import IAE, default_objectives
 from diffabs.scenario.defaults import braking
 
 pytestmark = pytest.mark.xdist_group("kernel tangents")
@@ -104,34 +104,34 @@ WAYS = {
 
 class TestLaunch:
     @killed_by(
-        "compiler/autodiff/linear.py",
+        "compiler.autodiff.linear",
         'self.graph.op("div", self.graph.const(1, node.dtype), value(args[1]))',
         "value(args[1])",
         case="of both",
     )
     @killed_by(
-        "compiler/autodiff/linear.py", 'self.graph.op("mul", x.number, y.number)', "x.number", case="three tangents"
+        "compiler.autodiff.linear", 'self.graph.op("mul", x.number, y.number)', "x.number", case="three tangents"
     )
     @killed_by(
-        "compiler/autodiff/jvp.py",
+        "compiler.autodiff.jvp",
         "tangent_copy(new[x.id], k) for",
         "tangent_copy(new[x.id], 0) for",
         case="three tangents",
     )
     @killed_by(
-        "compiler/runtime/jax_primitive.py",
+        "compiler.runtime.jax_primitive",
         "jnp.pad(x, wide), first, first + each,",
         "jnp.pad(x, wide), 0, each,",
         case="eleven tangents",
     )
     @killed_by(
-        "compiler/runtime/jax_primitive.py",
+        "compiler.runtime.jax_primitive",
         "x = jnp.moveaxis(x, 0, at)",
         "x = jnp.moveaxis(x[::-1], 0, at)",
         case="three tangents",
     )
     @killed_by(
-        "compiler/runtime/jax_primitive.py",
+        "compiler.runtime.jax_primitive",
         "jnp.moveaxis(x, axis, 0)\n            if shared:",
         "0 * x + jnp.moveaxis(x, axis, 0)[:1]\n            if shared:",
         case="for several gains",
@@ -142,7 +142,7 @@ class TestLaunch:
         assert np.abs(expected[..., :3]).max() > 0
         np.testing.assert_allclose(found, expected, rtol=2e-13, atol=1e-13)
 
-    @killed_by("compiler/autodiff/jvp.py", "if reached == moved_arrays[UpdateLevel.STEP]:", "if True:")
+    @killed_by("compiler.autodiff.jvp", "if reached == moved_arrays[UpdateLevel.STEP]:", "if True:")
     def test_only_what_moves_is_carried(self, monkeypatch):
         """The fourth number moves with nothing, and what comes from no tangent is no operation."""
         seen = []
@@ -157,7 +157,7 @@ class TestLaunch:
         assert seen[-1][UpdateLevel.LANE] == ()
 
     @pytest.mark.slow
-    @killed_by("compiler/autodiff/jvp.py", "if outputs_needed is not None:", "if False:")
+    @killed_by("compiler.autodiff.jvp", "if outputs_needed is not None:", "if False:")
     def test_only_what_is_asked_for_is_carried(self, monkeypatch):
         """The third number leads to nothing but itself, and has no tangent; the second has those that it has anyway."""
         seen = []
@@ -176,7 +176,7 @@ class TestLaunch:
 
     @pytest.mark.slow
     @killed_by(
-        "compiler/autodiff/eliminate.py",
+        "compiler.autodiff.eliminate",
         "x not in self.vertices and self.levels[x] < UpdateLevel.STEP for x in once",
         "True for x in once",
     )
@@ -197,7 +197,7 @@ class TestLaunch:
 
     @pytest.mark.slow
     @killed_by(
-        "compiler/runtime/jax_primitive.py", "MAX_TANGENTS_PER_LAUNCH = 8 ", "MAX_TANGENTS_PER_LAUNCH = 1 ", case="8-1"
+        "compiler.runtime.jax_primitive", "MAX_TANGENTS_PER_LAUNCH = 8 ", "MAX_TANGENTS_PER_LAUNCH = 1 ", case="8-1"
     )
     @pytest.mark.parametrize(("many", "launches"), [(8, 1), (9, 2)])
     def test_tangents_are_one_launch(self, many, launches, monkeypatch):
@@ -208,7 +208,7 @@ class TestLaunch:
         assert len(made) == launches
 
     @killed_by(
-        "compiler/runtime/jax_primitive.py",
+        "compiler.runtime.jax_primitive",
         "pe.custom_partial_eval_rules[run_lanes_primitive] = _refuse_partial_evaluation",
         "",
     )
@@ -226,7 +226,7 @@ class TestLaunch:
             reverse(lambda g: jnp.sum(chain(g, RATES)))
 
     @killed_by(
-        "compiler/runtime/jax_primitive.py", "    if seeds is not None:\n        raise", "    if False:\n        raise"
+        "compiler.runtime.jax_primitive", "    if seeds is not None:\n        raise", "    if False:\n        raise"
     )
     def test_second_derivatives_are_refused(self):
         with pytest.raises(ValueError, match="a kernel has no second derivatives"):
@@ -250,7 +250,7 @@ import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import diffabs as d
-from diffabs.objectives import IAE
+from diffabs.parts.objectives import IAE
 from diffabs.scenario.defaults import braking
 from test_kernel_tangents import chain
 
@@ -333,7 +333,7 @@ def test_a_part(family, name):
     )
 
 
-@killed_by("simulate/drive/kernel.py", "else method.for_derivatives()", "else method")
+@killed_by("engine.drive.kernel", "else method.for_derivatives()", "else method")
 @pytest.mark.slow
 def test_steps_end_on_kinks_where_those_of_xla_do():
     """Of a torque that comes to its limits: without, the derivatives would be others."""
@@ -351,9 +351,7 @@ def test_steps_end_on_kinks_where_those_of_xla_do():
     assert np.abs(blunt - known).max() > 1e-5 * np.abs(known).max()
 
 
-@killed_by(
-    "simulate/step/replay.py", "any_lane(entry.accepted)", "any_lane(entry.triggered != 0)", case="slip-lmi-adaptive"
-)
+@killed_by("engine.step.replay", "any_lane(entry.accepted)", "any_lane(entry.triggered != 0)", case="slip-lmi-adaptive")
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["grid", "kinks", "adaptive"])
 @pytest.mark.parametrize("name", scenario.names())

@@ -56,11 +56,9 @@ def text_of(name):
     return re.search(r"^BODY void step.*?^}\n", text, re.MULTILINE | re.DOTALL)[0]
 
 
-@killed_by("compiler/schedule.py", "use(gate.args[2], branch.yes)", "use(gate.args[2], block)", case="schedule")
-@killed_by(
-    "compiler/autodiff/replicate.py", 'name = "sub" if factor.negative', 'name = "add" if False', case="eliminate"
-)
-@killed_by("compiler/operations.py", '"lt({0}, {1})"', '"le({0}, {1})"', case="c")
+@killed_by("compiler.schedule", "use(gate.args[2], branch.yes)", "use(gate.args[2], block)", case="schedule")
+@killed_by("compiler.autodiff.replicate", 'name = "sub" if factor.negative', 'name = "add" if False', case="eliminate")
+@killed_by("compiler.operations", '"lt({0}, {1})"', '"le({0}, {1})"', case="c")
 @pytest.mark.parametrize("name", ["lower", "jvp", "eliminate", "schedule", "c"])
 def test_the_text_after_a_pass(name):
     if name in ("jvp", "eliminate") and jax.__version_info__ >= (0, 11):

@@ -16,12 +16,12 @@ from mutants import killed_by
 from project import ROOT
 
 import diffabs as d
-from diffabs.controllers import PID, BackCalculation, Cascade, Relay, Sampled
 from diffabs.core.pytree import parameters
 from diffabs.core.validity import check_part, find_cautions
-from diffabs.objectives import IAE
-from diffabs.references import Setpoint
-from diffabs.stops import NoStop
+from diffabs.parts.controllers import PID, BackCalculation, Cascade, Relay, Sampled
+from diffabs.parts.objectives import IAE
+from diffabs.parts.references import Setpoint
+from diffabs.parts.stops import NoStop
 
 SOLVER = d.FixedStep(1e-4, 0.12, every=1200, kinks=True)
 RTOL = 1e-6
@@ -63,8 +63,8 @@ def solved(rates, states):
 FURTHER = [((1.0, 1.0), 1.0), ((1.0, 1.0), -1.0), ((0.3, 0.0), -1.0), ((0.0, 0.6), 1.0)]
 
 
-@killed_by("controllers/pid.py", "self.kp * (self.b * signal.target", "self.kp * (signal.target")
-@killed_by("controllers/pid.py", "self.cutoff * (self.c * signal.target", "self.cutoff * (signal.target")
+@killed_by("parts.controllers.pid", "self.kp * (self.b * signal.target", "self.kp * (signal.target")
+@killed_by("parts.controllers.pid", "self.cutoff * (self.c * signal.target", "self.cutoff * (signal.target")
 @pytest.mark.parametrize(
     ("b", "c", "sign"),
     [
@@ -103,9 +103,9 @@ def cascade(**options):
     return Cascade(outer=outer, inner=inner, **options)
 
 
-@killed_by("controllers/cascade.py", "(name, *(field for", "(*names, *(field for")
+@killed_by("parts.controllers.cascade", "(name, *(field for", "(*names, *(field for")
 @killed_by(
-    "controllers/cascade.py",
+    "parts.controllers.cascade",
     "zip(memory.flow, memory.held, strict=True)",
     "zip(memory.flow[::-1], memory.held, strict=True)",
 )

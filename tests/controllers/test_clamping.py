@@ -9,10 +9,10 @@ from mutants import killed_by
 from signals import close, seen
 
 import diffabs as d
-from diffabs.controllers import PID, Clamping, Sampled
 from diffabs.core.protocols import Clock, Memory, Tracking
-from diffabs.objectives import IAE
-from diffabs.simulate.admissible import batch_admissibility
+from diffabs.engine.admissible import batch_admissibility
+from diffabs.parts.controllers import PID, Clamping, Sampled
+from diffabs.parts.objectives import IAE
 
 SOLVERS = [d.FixedStep(1e-2, 10.0), d.Adaptive(1e-6, 10.0, 1e-2)]
 AT = {"ki": 5.0, "kp": 2.0, "high": 3.0}
@@ -24,7 +24,7 @@ def iae(numbers, solver, tracking_time=0.01):
     return d.measure(loop, solver, {"iae": IAE()}).metrics["iae"]
 
 
-@killed_by("controllers/antiwindup.py", "smaller(0.0 * error, error), larger(0.0 * error, error)", "-1e9, 1e9")
+@killed_by("parts.controllers.antiwindup", "smaller(0.0 * error, error), larger(0.0 * error, error)", "-1e9, 1e9")
 @pytest.mark.parametrize(
     "solver", cases([d.FixedStep(1e-2, 10.0), d.Adaptive(1e-6, 10.0, 1e-2)], d.Adaptive(1e-6, 10.0, 1e-2))
 )
@@ -58,7 +58,7 @@ def test_the_rate_lies_between_zero_and_the_error():
     close([law.rate(error, gain, 3.0 + excess, 3.0) for error, gain, excess, _ in rows], [row[-1] for row in rows])
 
 
-@killed_by("controllers/sampled.py", "_at_period(self.controller, clock.h).flow", "self.controller.flow")
+@killed_by("parts.controllers.sampled", "_at_period(self.controller, clock.h).flow", "self.controller.flow")
 def test_a_sampled_controller_uses_its_period():
     """With Tt = period, one Euler step puts the output on the limit if that needs between nothing and the whole
     error."""
@@ -69,7 +69,7 @@ def test_a_sampled_controller_uses_its_period():
     close(after.flow.integral, 0.16 + 0.05 * 0.5 - 0.1 / 10.0)
 
 
-@killed_by("simulate/stability.py", "jnp.maximum(rates, drain)", "rates")
+@killed_by("engine.stability", "jnp.maximum(rates, drain)", "rates")
 def test_a_step_too_long_for_the_tracking_time_is_refused():
     loop = sliding.limited_pi(Clamping(tracking_time=0.01))
     with pytest.raises(ValueError, match=r"solver.step = 0.03 s is not stable.*\(0, 0.0278\] s"):

@@ -8,11 +8,11 @@ from mutants import killed_by
 from signals import Mean
 
 import diffabs as d
-from diffabs.actuators import Limits
-from diffabs.controllers import PlayedCommand
+from diffabs.parts.actuators import Limits
+from diffabs.parts.controllers import PlayedCommand
 
 
-@killed_by("controllers/playback.py", "jnp.minimum(played, commands.size - 1)", "played % commands.size")
+@killed_by("parts.controllers.playback", "jnp.minimum(played, commands.size - 1)", "played % commands.size")
 def test_entries_in_turn_and_the_last_one_stays():
     controller = PlayedCommand(commands=np.array([1.0, 4.0, 2.0]), period=0.01)
     run = d.rollout(loop(controller, Limits()), d.FixedStep(2e-3, 0.05), {"mean": Mean()})

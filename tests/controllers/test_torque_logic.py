@@ -8,9 +8,9 @@ from mutants import killed_by
 from signals import Mean, Script, seen
 
 import diffabs as d
-from diffabs.actuators import Lag
-from diffabs.controllers import BandLogic, FourPhase, Sampled
 from diffabs.core.blocks import Direct
+from diffabs.parts.actuators import Lag
+from diffabs.parts.controllers import BandLogic, FourPhase, Sampled
 
 RISING = Script(read=lambda t: seen(0.4 * t))  # slip 0.4 t
 LENGTH = 0.5
@@ -23,10 +23,10 @@ def mean(controller, plant=RISING, length=LENGTH):
     return float(run.metrics["mean"][1])
 
 
-@killed_by("controllers/torque_logic.py", "phase == 2, 1.0, 0.0", "phase == 2, 2.0, 0.0")
-@killed_by("controllers/torque_logic.py", "self.slip_high - slip, slip - self.slip_low", "1.0, slip - self.slip_low")
-@killed_by("controllers/torque_logic.py", "(phase == 2) & (slip <= self.slip_low)", "phase > 4", case="falls")
-@killed_by("controllers/torque_logic.py", "jnp.where(phase == 0, slip >= self.slip_high,", "(", case="high")
+@killed_by("parts.controllers.torque_logic", "phase == 2, 1.0, 0.0", "phase == 2, 2.0, 0.0")
+@killed_by("parts.controllers.torque_logic", "self.slip_high - slip, slip - self.slip_low", "1.0, slip - self.slip_low")
+@killed_by("parts.controllers.torque_logic", "(phase == 2) & (slip <= self.slip_low)", "phase > 4", case="falls")
+@killed_by("parts.controllers.torque_logic", "jnp.where(phase == 0, slip >= self.slip_high,", "(", case="high")
 @pytest.mark.parametrize(
     ("plant", "slip_low", "slip_high", "area"),
     [
@@ -44,7 +44,7 @@ def test_four_phases(plant, slip_low, slip_high, area):
     np.testing.assert_allclose(mean(logic, plant), area / LENGTH, rtol=1e-9)
 
 
-@killed_by("controllers/torque_logic.py", "slip > self.slip_high, -self.decay", "slip > self.slip_high, self.decay")
+@killed_by("parts.controllers.torque_logic", "slip > self.slip_high, -self.decay", "slip > self.slip_high, self.decay")
 def test_a_band_logic_is_three_exponentials():
     logic = BandLogic(slip_low=0.08, slip_high=0.12, growth=3.0, decay=5.0, torque=10.0)
     top = 10 * np.exp(3.0 * 0.2)  # slip 0.08 at 0.2 s, 0.12 at 0.3 s
@@ -52,8 +52,8 @@ def test_a_band_logic_is_three_exponentials():
     np.testing.assert_allclose(mean(logic), area / LENGTH, rtol=1e-8)
 
 
-@killed_by("controllers/torque_logic.py", "& (memory.flow < self.high)", "")
-@killed_by("controllers/torque_logic.py", "smaller(self.torque, self.high)", "self.torque", case="20.0")
+@killed_by("parts.controllers.torque_logic", "& (memory.flow < self.high)", "")
+@killed_by("parts.controllers.torque_logic", "smaller(self.torque, self.high)", "self.torque", case="20.0")
 @pytest.mark.parametrize("torque", [10.0, 20.0])
 def test_a_band_logic_falls_from_its_limit_at_once(torque):
     """At 12 from the start or from 10 exp(3 t) on, to slip 0.12 at 0.3 s; then 12 exp(-5 (t - 0.3))."""

@@ -8,12 +8,20 @@ import pytest
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.controllers import PID, BackCalculation, BandLogic, ConstantInput, PlayedCommand, Sampled, SampledOnGrid
 from diffabs.core.protocols import no_flow, no_memory
 from diffabs.core.pytree import param, pytree
 from diffabs.core.validity import find_problems
-from diffabs.plants import BrakeStart, MirroredRig
-from diffabs.references import FixedSlip
+from diffabs.parts.controllers import (
+    PID,
+    BackCalculation,
+    BandLogic,
+    ConstantInput,
+    PlayedCommand,
+    Sampled,
+    SampledOnGrid,
+)
+from diffabs.parts.plants import BrakeStart, MirroredRig
+from diffabs.parts.references import FixedSlip
 from diffabs.scenario.defaults import braking
 
 PERIOD, STEP, SAMPLES = 1e-3, 5e-4, 60
@@ -128,10 +136,10 @@ class Filter:
         return memory
 
 
-@killed_by("controllers/sampled.py", "(decay) * as_rule_array(period) < 1", "(decay) < 1e9")
-@killed_by("controllers/sampled.py", 'hasattr(controller, "period")', "False")
-@killed_by("controllers/sampled.py", 'if offers(controller, "tick") and', "if")
-@killed_by("controllers/sampled.py", "isinstance(controller, PID)", 'hasattr(controller, "cutoff")')
+@killed_by("parts.controllers.sampled", "(decay) * as_rule_array(period) < 1", "(decay) < 1e9")
+@killed_by("parts.controllers.sampled", 'hasattr(controller, "period")', "False")
+@killed_by("parts.controllers.sampled", 'if offers(controller, "tick") and', "if")
+@killed_by("parts.controllers.sampled", "isinstance(controller, PID)", 'hasattr(controller, "cutoff")')
 @pytest.mark.parametrize(
     ("controller", "line"),
     [
@@ -156,14 +164,14 @@ def test_a_controller_that_does_not_fit_its_period(controller, line):
         assert all(one.startswith(line) for one in problems)
 
 
-@killed_by("controllers/sampled.py", "memory, signal, _refuse_rate))", "memory, signal, None))")
+@killed_by("parts.controllers.sampled", "memory, signal, _refuse_rate))", "memory, signal, None))")
 def test_a_sampled_controller_has_no_rate():
     with pytest.raises(ValueError, match="the signal of a sampled controller has no rate"):
         d.check(rig(Sampled(controller=Filter())), d.FixedStep(STEP, 1.0))
 
 
 @killed_by(
-    "controllers/sampled.py",
+    "parts.controllers.sampled",
     "as_rule_array(period) < 2 * as_rule_array(tracking_time)",
     "as_rule_array(period) < 200 * as_rule_array(tracking_time)",
 )

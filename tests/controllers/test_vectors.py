@@ -8,9 +8,9 @@ import pytest
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.objectives import IAE
-from diffabs.plants import QuarterCar
-from diffabs.simulate.contracts import find_misfits
+from diffabs.engine.contracts import find_misfits
+from diffabs.parts.objectives import IAE
+from diffabs.parts.plants import QuarterCar
 
 SOLVER = d.FixedStep(1e-5, 3e-5)
 
@@ -42,10 +42,10 @@ def placed(name, part):
 
 
 @killed_by(
-    "roads/patches.py", "edges = jnp.asarray(self.edges)", "edges = np.asarray(self.edges)", case="roads.Patches"
+    "parts.roads.patches", "edges = jnp.asarray(self.edges)", "edges = np.asarray(self.edges)", case="roads.Patches"
 )
 @killed_by(
-    "controllers/gain_schedule.py",
+    "parts.controllers.gain_schedule",
     "map(jnp.asarray, (self.speeds",
     "((self.speeds",
     case="controllers.ScheduledFeedback",

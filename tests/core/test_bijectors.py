@@ -7,11 +7,11 @@ import pytest
 from mutants import killed_by
 from scipy.special import logit
 
-from diffabs.controllers import PID, StateFeedback
 from diffabs.core.bijectors import parameter_space
+from diffabs.parts.controllers import PID, StateFeedback
 
 
-@killed_by("core/bijectors.py", "if inside and isinstance(mapping, Decades):", "if False:")
+@killed_by("core.bijectors", "if inside and isinstance(mapping, Decades):", "if False:")
 def test_a_low_start_in_many_decades_has_a_place():
     """The range is mapped in the logarithm: there 5e-4 is in the middle, and 1e-6 (1 + 1e-9) at the end."""
     part, ends = PID(kp=60.0, ki=5e-4), {"ki": (1e-6, 1e6)}
@@ -24,7 +24,7 @@ def test_a_low_start_in_many_decades_has_a_place():
         parameter_space(PID(kp=60.0, ki=1e-6 * (1 + 1e-9)), ends)
 
 
-@killed_by("core/bijectors.py", "else sum(finite))", "else max(1.0, *finite))", case="5e-10-0.0")
+@killed_by("core.bijectors", "else sum(finite))", "else max(1.0, *finite))", case="5e-10-0.0")
 @pytest.mark.parametrize(("start", "end"), [(5e-10, 0.0), (1e-300, 0.0), (1.0 + 1e-6, 1.0)])
 def test_a_start_near_the_end_of_a_half_line_has_a_place(start, end):
     """It is 0, and a unit there is a factor e in the distance from the end."""
@@ -34,8 +34,8 @@ def test_a_start_near_the_end_of_a_half_line_has_a_place(start, end):
     assert space.values(np.ones(1))["kp"] - end == pytest.approx(math.e * (start - end), rel=1e-6)
 
 
-@killed_by("core/bijectors.py", "inside = low < value < high", "inside = low <= value <= high", case="0.0-0.0")
-@killed_by("core/bijectors.py", "room = END_SHARE * (", "room = 0.0 * (", case="1.000000000001-1.0")
+@killed_by("core.bijectors", "inside = low < value < high", "inside = low <= value <= high", case="0.0-0.0")
+@killed_by("core.bijectors", "room = END_SHARE * (", "room = 0.0 * (", case="1.000000000001-1.0")
 @pytest.mark.parametrize(("start", "end"), [(0.0, 0.0), (0.5, 1.0), (1.0 + 1e-12, 1.0), (math.inf, 0.0)])
 def test_a_start_that_cannot_leave_its_end_is_refused(start, end):
     with pytest.raises(ValueError, match=r"is not inside .*: it cannot be moved from there"):

@@ -12,8 +12,12 @@ from scipy.optimize import brentq
 from signals import H, Mean, Script, close, seen
 
 import diffabs as d
-from diffabs.actuators import Lag, Limits, RateLimit
-from diffabs.controllers import (
+from diffabs.core.blocks import Series, offers
+from diffabs.core.protocols import BrakeOutput, Clock, Memory, Sample, Tracking
+from diffabs.core.validity import check_part
+from diffabs.engine.step.runge_kutta import rk4_step
+from diffabs.parts.actuators import Lag, Limits, RateLimit
+from diffabs.parts.controllers import (
     PID,
     BackCalculation,
     Clamping,
@@ -27,13 +31,10 @@ from diffabs.controllers import (
     SlidingMode,
     StateFeedback,
 )
-from diffabs.controllers.pid import PIDMemory
-from diffabs.core.blocks import Series, offers
-from diffabs.core.protocols import BrakeOutput, Clock, Memory, Sample, Tracking
-from diffabs.core.validity import check_part
-from diffabs.objectives import IAE, ITAE, MaxSlip, SettlingTime
-from diffabs.plants import BrakeStart, MirroredRig
-from diffabs.references import (
+from diffabs.parts.controllers.pid import PIDMemory
+from diffabs.parts.objectives import IAE, ITAE, MaxSlip, SettlingTime
+from diffabs.parts.plants import BrakeStart, MirroredRig
+from diffabs.parts.references import (
     ExtremumSeeking,
     FilteredSlip,
     FixedSlip,
@@ -42,9 +43,8 @@ from diffabs.references import (
     PeakRobust,
     SlipByDeceleration,
 )
-from diffabs.sensors import Bias, IntegratedAccelerometer, Noise, Quantisation, SpeedScale, WheelSpeed
-from diffabs.simulate.step.runge_kutta import rk4_step
-from diffabs.stops import NoStop, SpeedReached, Standstill
+from diffabs.parts.sensors import Bias, IntegratedAccelerometer, Noise, Quantisation, SpeedScale, WheelSpeed
+from diffabs.parts.stops import NoStop, SpeedReached, Standstill
 
 
 def sample(output, t=1.0):
@@ -90,7 +90,7 @@ def test_pid_by_hand():
 
 
 @killed_by(
-    "controllers/pid.py",
+    "parts.controllers.pid",
     "return PIDMemory(integral, self._filter_rate(memory, signal))",
     "return PIDMemory(integral, 0.0 * integral)",
 )
@@ -103,7 +103,7 @@ def test_pi_and_filtered_derivative_to_a_step():
 
 
 @killed_by(
-    "controllers/antiwindup.py",
+    "parts.controllers.antiwindup",
     "ratio(limited - raw, gain * self.tracking_time)",
     "ratio(raw - limited, gain * self.tracking_time)",
 )
@@ -150,7 +150,7 @@ def test_scheduled_feedback_interpolates_its_gains():
         close(k.flow(0.0, Memory(0.3), signal), fixed.flow(0.0, Memory(0.3), signal))
 
 
-@killed_by("core/numerics.py", "jnp.where(x >= nodes[1:], 1.0,", "jnp.where(x >= nodes[1:], 0.0,")
+@killed_by("core.numerics", "jnp.where(x >= nodes[1:], 1.0,", "jnp.where(x >= nodes[1:], 0.0,")
 def test_scheduled_feedback_interpolates_between_many_nodes():
     """Against NumPy: before the first node, at nodes, between, beyond the last; rounding only."""
     nodes, values = np.array([2.0, 3.0, 5.0, 9.0]), np.array([-1.0, -5.0, -2.0, -7.0])
@@ -161,7 +161,7 @@ def test_scheduled_feedback_interpolates_between_many_nodes():
         close(k.output(0.0, Memory(0.3), signal), -0.1 * np.interp(speed, nodes, values))
 
 
-@killed_by("controllers/gain_schedule.py", "(signal.measured.speed / self.reference_speed)", "1.0")
+@killed_by("parts.controllers.gain_schedule", "(signal.measured.speed / self.reference_speed)", "1.0")
 def test_proportional_is_state_feedback_scaled_by_speed():
     k = ProportionalFeedback(gain=np.array([-30.0, -5.0]), reference_speed=4.0, high=9.0)
     for speed, part in ((4.0, 1.0), (1.0, 0.25), (8.0, 2.0)):  # all beyond 9 N m with an integral of -3
@@ -172,9 +172,9 @@ def test_proportional_is_state_feedback_scaled_by_speed():
         close(k.flow(0.0, Memory(-0.03), signal), -0.1)
 
 
-@killed_by("core/units.py", 'for name in ("control", "signal"):', 'for name in ("control",):')
-@killed_by("core/rules.py", '"" if unit == "1" else', '"" if unit == "0" else')
-@killed_by("core/validity.py", 'shapes.append(f"{field.name} {line}")', "pass")
+@killed_by("core.units", 'for name in ("control", "signal"):', 'for name in ("control",):')
+@killed_by("core.rules", '"" if unit == "1" else', '"" if unit == "0" else')
+@killed_by("core.validity", 'shapes.append(f"{field.name} {line}")', "pass")
 @pytest.mark.parametrize(
     ("part", "message"),
     [
@@ -194,9 +194,9 @@ def test_a_part_is_refused_by_its_own_check(part, message):
         check_part(part)
 
 
-@killed_by("controllers/switching.py", "return (self.band + jnp.where", "return (0.0 * self.band + jnp.where")
+@killed_by("parts.controllers.switching", "return (self.band + jnp.where", "return (0.0 * self.band + jnp.where")
 @killed_by(
-    "simulate/step/event_location.py",
+    "engine.step.event_location",
     "length = place - margin / jnp.where(at_place < 0, at_place, -jnp.inf)",
     "length = place",
 )
@@ -216,7 +216,7 @@ def test_relay_switches_on_the_far_side_of_its_band():
 
 
 @pytest.mark.slow
-@killed_by("simulate/step/event_location.py", "enough & ~at_once & crossings.another", "enough & ~at_once & False")
+@killed_by("engine.step.event_location", "enough & ~at_once & crossings.another", "enough & ~at_once & False")
 def test_two_events_in_one_step():
     """The deceleration has its maximum 0.3 into step 5, at a slip of 0.15; the relay, whose target is that from then
     on, releases at 0.16; with the target before it, it would at 0.21, 0.8 into the step. The slip bends so that a
@@ -238,7 +238,7 @@ def test_two_events_in_one_step():
 
 @pytest.mark.slow
 @killed_by(
-    "simulate/step/fixed.py",
+    "engine.step.fixed",
     "jnp.where(extra > max_extra, RunStatus.EXHAUSTED, status)",
     "jnp.where(extra > max_extra, RunStatus.TIMED_OUT, status)",
 )
@@ -257,8 +257,8 @@ def test_what_switches_in_every_step_is_no_run():
 
 
 @pytest.mark.slow
-@killed_by("objectives/tracking.py", "cubic.start * cubic.end < 0", "cubic.start * cubic.end < -1e9")
-@killed_by("core/cubic.py", "return jnp.where(inside & (top > ends), top, ends)", "return ends")
+@killed_by("parts.objectives.tracking", "cubic.start * cubic.end < 0", "cubic.start * cubic.end < -1e9")
+@killed_by("core.cubic", "return jnp.where(inside & (top > ends), top, ends)", "return ends")
 @pytest.mark.parametrize("h", [1e-3, 5e-4])
 def test_the_integral_of_an_error_that_changes_sign(h):
     """Of 0.03 |sin(w t)| over five and a quarter periods that no step divides, and with the weight t; and its peak."""
@@ -279,12 +279,12 @@ def test_the_integral_of_an_error_that_changes_sign(h):
 
 @pytest.mark.slow
 @killed_by(
-    "core/messages.py",
+    "core.messages",
     "Shown.of(self.start), Shown.of(self.end)",
     "Shown.of(self.start), Shown.of(self.end)._replace(setpoint=self.start.setpoint)",
 )
 @killed_by(
-    "core/messages.py",
+    "core.messages",
     "self.h * rate, rates) for rates in self.shown_rates())",
     "self.h * rate, rates._replace(setpoint=0.0 * rates.setpoint)) for rates in self.shown_rates())",
 )
@@ -324,7 +324,7 @@ def test_sliding_mode():
     close([mode.output(0.0, Memory(), tracking(e, 5.0)) for e in (0.05, -0.02, 0.3, -0.3)], [25.0, -3.0, 45.0, -35.0])
 
 
-@killed_by("controllers/sampled.py", "t + self.delay - jax", "t - jax")
+@killed_by("parts.controllers.sampled", "t + self.delay - jax", "t - jax")
 @pytest.mark.parametrize("delay", cases([0.0, 1.5, 2.0, 4.0], 0.0, 2.0, 4.0))
 def test_sampled_is_a_zero_order_hold(delay):
     """Against the textbook loop: u_k held from t_k + delay on, integral by forward Euler."""
@@ -365,7 +365,7 @@ def parabola(t, top=5.3e-3, a=9.0, bend=4e4):
 
 @pytest.mark.slow
 @killed_by(
-    "simulate/step/event_location.py",
+    "engine.step.event_location",
     "jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier",
     "x, True",
 )
@@ -387,7 +387,7 @@ def two_maxima(t):
     return seen(0.1 + t, deceleration=values[i] + (values[i + 1] - values[i]) * x * x * (3 - 2 * x))
 
 
-@killed_by("references/peak_slip.py", "zero + MIN_DECELERATION, slip", "zero, slip")
+@killed_by("parts.references.peak_slip", "zero + MIN_DECELERATION, slip", "zero, slip")
 def test_latch_waits_for_the_brake():
     """A wheel that rolls shows a deceleration of some 1e-5 m/s^2 in single precision, up and down; then the brake."""
 
@@ -432,7 +432,7 @@ def test_latch_does_not_move_for_rounding():
     close(target, [0.2] * 3 + [0.1022] * 5, rtol=1e-9)
 
 
-@killed_by("core/loop.py", "((a >= 0) & ((b < 0) | (c < 0)))", "((a >= 0) & (c < 0))")
+@killed_by("core.loop", "((a >= 0) & ((b < 0) | (c < 0)))", "((a >= 0) & (c < 0))")
 @pytest.mark.slow
 def test_a_noisy_sampled_accelerometer_latches_on_a_drop():
     """a = 3 + 50 t + noise that is held for 2 steps: a jump down from more than ever is a maximum, wherever it goes to,
@@ -460,7 +460,7 @@ def test_literal_follows_the_slip_while_friction_rises():
 
 
 @pytest.mark.slow
-@killed_by("references/peak_slip.py", "(m.latched < 0.5) & (m.greatest > self.arming)", "(m.latched < 0.5)")
+@killed_by("parts.references.peak_slip", "(m.latched < 0.5) & (m.greatest > self.arming)", "(m.latched < 0.5)")
 @pytest.mark.parametrize(("threshold", "arming", "latches"), [(0.05, 3.0, True), (0.05, 9.1, False), (0.5, 3.0, False)])
 def test_robust_latch(threshold, arming, latches):
     """A low-pass turns A - B t^2 into A - B T^2 - B (t - T)^2, slip likewise. With top 9.3 ms, T = 0.2 ms, the level
@@ -502,7 +502,7 @@ def test_two_lags_in_series():
 # Sensors
 
 
-@killed_by("core/messages.py", "self.on_grid & (self.k % n == 0)", "self.on_grid & (self.k % n == 1)")
+@killed_by("core.messages", "self.on_grid & (self.k % n == 0)", "self.on_grid & (self.k % n == 1)")
 def test_noise():
     """10^4 draws: their mean within 4/sqrt(10^4) and their deviation within 4/sqrt(2 10^4) of the deviation."""
     noise = Noise(slip=0.1, speed=2.0, wheel_speed=0.5, deceleration=3.0, period=2 * H)
@@ -537,7 +537,7 @@ def test_wheel_speed_lags_a_ramp():
     close(y.slip, (20.0 - y.wheel_speed) / 30.0)
 
 
-@killed_by("sensors/speed.py", "return self.bias - signal.deceleration", "return -signal.deceleration")
+@killed_by("parts.sensors.speed", "return self.bias - signal.deceleration", "return -signal.deceleration")
 def test_integrated_accelerometer():
     """v = v0 - a t + bias t; slip (v - w)/v."""
     t = H * np.arange(30)
@@ -548,7 +548,7 @@ def test_integrated_accelerometer():
     close(y.deceleration, 7.5)
 
 
-@killed_by("sensors/speed.py", "slip=(v - signal.wheel_speed) / jnp.maximum(v, self.floor), speed=v)", "speed=v)")
+@killed_by("parts.sensors.speed", "slip=(v - signal.wheel_speed) / jnp.maximum(v, self.floor), speed=v)", "speed=v)")
 def test_a_speed_seen_low_hides_slip():
     """At 20 m/s with the rim at 16: seen as 19, slip 3/19 instead of 0.2; a wheel that rolls seems to be driven. The
     floor stands in for the speed below it, the accelerometer and the distance are as they are."""

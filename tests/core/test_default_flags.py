@@ -48,7 +48,7 @@ def exact_slopes():
     return -np.asarray(TIMES) * np.sin(np.outer(RATES, TIMES))
 
 
-@killed_by("simulate/solve.py", "@default_flags()\ndef solve(", "def solve(")
+@killed_by("engine.solve", "@default_flags()\ndef solve(", "def solve(")
 def test_fields(strict):
     rows = np.asarray(position(RATE))
     np.testing.assert_allclose(rows[:, 0], np.cos(np.asarray(RATE) * np.asarray(TIMES)), atol=1e-6)
@@ -67,7 +67,7 @@ def test_derivatives_of_fields(strict):
 
 
 @pytest.mark.slow
-@killed_by("simulate/drive/deferred.py", "@default_flags()\ndef _lower(", "def _lower(")
+@killed_by("engine.drive.deferred", "@default_flags()\ndef _lower(", "def _lower(")
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivatives_of_fields_with_adaptive_steps(strict, mode):
     slopes = jax.jit(jax.vmap(mode(position)))(RATES)
@@ -99,9 +99,9 @@ def usual():
 
 
 @pytest.mark.slow
-@killed_by("simulate/drive/sharding.py", "with default_flags(), jax.enable_x64", "with jax.enable_x64")
-@killed_by("simulate/run.py", "@default_flags()\ndef measure(", "def measure(")
-@killed_by("simulate/run.py", "@default_flags()\ndef rollout(", "def rollout(")
+@killed_by("engine.drive.sharding", "with default_flags(), jax.enable_x64", "with jax.enable_x64")
+@killed_by("engine.run", "@default_flags()\ndef measure(", "def measure(")
+@killed_by("engine.run", "@default_flags()\ndef rollout(", "def rollout(")
 def test_loops_compute_the_same(strict, usual):
     jax.clear_caches()  # a traced program keeps the flags of its trace
     jax.tree.map(np.testing.assert_array_equal, run_all(), usual)

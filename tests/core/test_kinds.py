@@ -84,7 +84,7 @@ def test_a_list_is_an_array():
     assert listed == tupled == iae(d.replace(RIG, {"controller.gain": np.array([-9e3, -40.0])}))
 
 
-@killed_by("core/validity.py", "spec.shape in (None, shape)", "True")
+@killed_by("core.validity", "spec.shape in (None, shape)", "True")
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
@@ -148,8 +148,8 @@ def test_objectives_are_looked_at_too():
         ((1e-3, 0.5), "solver = (0.001, 0.5) is no solver; d.FixedStep(step=..., duration=...) or d.Adaptive(rtol="),
     ],
 )
-@killed_by("simulate/admissible.py", "if not 0 < value < math.inf:", "if False:")
-@killed_by("simulate/admissible.py", '"rtol" and value >= 1', '"rtol" and value >= 99')
+@killed_by("engine.admissible", "if not 0 < value < math.inf:", "if False:")
+@killed_by("engine.admissible", '"rtol" and value >= 1', '"rtol" and value >= 99')
 def test_a_solver_that_no_run_can_have(solver, message):
     """A run, a check of one loop, and a check of a batch say the same."""
     batch = d.Batch({"plant.mass": [5.3]})

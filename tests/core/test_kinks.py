@@ -13,8 +13,13 @@ from marks import cases
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.actuators import Delay, Lag
-from diffabs.controllers import (
+from diffabs.core.loop import Loop
+from diffabs.core.numerics import quotient, searchsorted
+from diffabs.core.pytree import param, pytree, static
+from diffabs.engine.step.comparisons import SwitchedProgram
+from diffabs.engine.step.modes import Mode, find_contradicted
+from diffabs.parts.actuators import Delay, Lag
+from diffabs.parts.controllers import (
     PID,
     Clamping,
     ConstantTorque,
@@ -23,17 +28,12 @@ from diffabs.controllers import (
     ScheduledFeedback,
     StateFeedback,
 )
-from diffabs.core.loop import Loop
-from diffabs.core.numerics import quotient, searchsorted
-from diffabs.core.pytree import param, pytree, static
-from diffabs.objectives import IAE, Effort, FinalError
-from diffabs.plants import LabRig, MirroredRig
-from diffabs.references import FixedSlip, Setpoint
-from diffabs.roads import DRY_ASPHALT
+from diffabs.parts.objectives import IAE, Effort, FinalError
+from diffabs.parts.plants import LabRig, MirroredRig
+from diffabs.parts.references import FixedSlip, Setpoint
+from diffabs.parts.roads import DRY_ASPHALT
+from diffabs.parts.stops import SpeedReached
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.step.comparisons import SwitchedProgram
-from diffabs.simulate.step.modes import Mode, find_contradicted
-from diffabs.stops import SpeedReached
 
 KNOTS = np.array([-1.0, 0.0, 0.5, 2.0, 3.0])
 POINTS = (-3.0, -1.0, -0.3, 0.0, 0.2, 0.7, 1.0, 2.5, 9.0)
@@ -89,14 +89,12 @@ def same(out: Any) -> Any:
 
 
 @killed_by(
-    "simulate/step/comparisons.py",
+    "engine.step.comparisons",
     "key = (y, x, not strict) if turned else (x, y, strict)",
     "key = (x, y, strict)",
     case="a contrary",
 )
-@killed_by(
-    "simulate/step/comparisons.py", "asks = name if moves and real", "asks = name if real", case="of what is fixed"
-)
+@killed_by("engine.step.comparisons", "asks = name if moves and real", "asks = name if real", case="of what is fixed")
 @pytest.mark.parametrize("name", cases(KINKED, "in a loop", "in one of three", "a conditional", "many"))
 def test_a_program_is_the_function(name):
     f, count = KINKED[name]
@@ -121,7 +119,7 @@ def test_a_regime_goes_on_beyond_its_kinks(name, at, beyond, value, slope):
 
 
 @pytest.mark.slow
-@killed_by("simulate/step/modes.py", "against = margin < -_rounding_error(x)", "against = margin < -jnp.inf", case="gt")
+@killed_by("engine.step.modes", "against = margin < -_rounding_error(x)", "against = margin < -jnp.inf", case="gt")
 @pytest.mark.parametrize("name", [name for name, (_, count) in KINKED.items() if count])
 def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
     f, _ = KINKED[name]
@@ -146,7 +144,7 @@ def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
         assert answers.words == held(one, 2.2).words
 
 
-@killed_by("simulate/step/modes.py", "jnp.where(below > 0, first + below - 1, NO_BIT)", "first + below - 1")
+@killed_by("engine.step.modes", "jnp.where(below > 0, first + below - 1, NO_BIT)", "first + below - 1")
 def test_a_search_below_all_knots_has_one_side():
     """Bit 0 is max(x, p), the next five are the knots. Below all knots the search has no lower side."""
     one = program(lambda x, p: jnp.maximum(x, p) + jnp.arange(6.0)[searchsorted(jnp.asarray(KNOTS) + 10.0, x)])
@@ -156,12 +154,12 @@ def test_a_search_below_all_knots_has_one_side():
     assert found[3] == pytest.approx(-0.1)
 
 
-@killed_by("simulate/step/inner_functions.py", '"remat", "remat2", ', "")
+@killed_by("engine.step.inner_functions", '"remat", "remat2", ', "")
 def test_a_comparison_within_a_checkpoint_is_seen():
     assert program(jax.checkpoint(lambda x, p: jnp.maximum(x, p))).bit_count == 1
 
 
-@killed_by("simulate/step/inner_functions.py", "jax.lax.stop_gradient(x), x) if _is_real(x)", "x, x) if _is_real(x)")
+@killed_by("engine.step.inner_functions", "jax.lax.stop_gradient(x), x) if _is_real(x)", "x, x) if _is_real(x)")
 def test_a_branch_that_is_not_taken_has_no_infinite_derivative():
     def root(x: Any, p: Any) -> Any:
         return jax.lax.cond(x > p, lambda x: jnp.abs(x) * jnp.sqrt(x - p), lambda x: x, x)
@@ -182,7 +180,7 @@ def test_what_a_loop_hides_is_told():
     assert one.hidden == []
 
 
-@killed_by("simulate/step/modes.py", "limits.eps**ROUNDING_POWER *", "0.0 *")
+@killed_by("engine.step.modes", "limits.eps**ROUNDING_POWER *", "0.0 *")
 def test_numbers_that_are_equal_to_rounding_say_nothing():
     one = program(lambda x, p: jnp.where(x > p, 1.0, 0.0))
     regime = held(one, 0.1)
@@ -190,7 +188,7 @@ def test_numbers_that_are_equal_to_rounding_say_nothing():
         assert any(one.look(same, 0.6 + excess, 0.6, regime)[1].contradicted) == sees
 
 
-@killed_by("simulate/step/modes.py", "against |= gives & (margin == 0) & (says() != answer)", "pass")
+@killed_by("engine.step.modes", "against |= gives & (margin == 0) & (says() != answer)", "pass")
 def test_a_product_that_has_become_0_is_held_by_nobody():
     """(x - min(x, p)) x > 0 above p, and 0 > 0 below, which contradicts nobody: it gives way all the same."""
     one = program(lambda x, p: jnp.where((x - jnp.minimum(x, p)) * x > 0, 1.0, 0.0))
@@ -282,13 +280,13 @@ def clockwork(rate: Any, place: Any) -> Loop:
 
 @pytest.mark.slow
 @killed_by(
-    "simulate/step/modes.py",
+    "engine.step.modes",
     "next = below + jnp.where(high < -_rounding_error(x), 1, 0) - jnp.where(low < -_rounding_error(x), 1, 0)",
     "next = below",
     case="a table",
 )
 @killed_by(
-    "simulate/step/fixed.py",
+    "engine.step.fixed",
     "dataclasses.replace(self, kinks=self.kinks is not False,",
     "dataclasses.replace(self, kinks=False,",
     case="a jump",
@@ -340,7 +338,7 @@ def test_a_step_ends_on_a_comparison_near_the_start():
 
 @pytest.mark.slow
 @killed_by(
-    "simulate/step/fixed.py",
+    "engine.step.fixed",
     "gave_up &= decision.searches & (after.search.number < system.bit_count)",
     "gave_up &= False",
 )
@@ -361,7 +359,7 @@ def test_a_run_that_slides_along_a_kink_is_a_run():
 
 @pytest.mark.slow
 @killed_by(
-    "simulate/step/fixed.py",
+    "engine.step.fixed",
     "valid &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True",
     "pass",
 )
@@ -419,7 +417,7 @@ def integrating(late: float) -> tuple[Loop, float]:
     return Loop(**{**vars(loop), **parts}), most**2 * leaves + square(END - late) - square(leaves)
 
 
-@killed_by("simulate/step/fixed.py", "loop.jumps if self.kinks is None", "False if self.kinks is None")
+@killed_by("engine.step.fixed", "loop.jumps if self.kinks is None", "False if self.kinks is None")
 @pytest.mark.parametrize("late", [0.0, pytest.param(0.0337, marks=pytest.mark.slow)])
 def test_where_a_rate_jumps_a_value_is_right_too(late):
     """An integral that waits for a limit starts at once when the limit is left: in the middle of a step of 10 ms, which

@@ -59,7 +59,7 @@ def table():
 TABLE = table()
 
 
-@killed_by("actuators/lag.py", '    """Lower limit of the control."""\n', "")
+@killed_by("parts.actuators.lag", '    """Lower limit of the control."""\n', "")
 def test_every_parameter_has_a_meaning():
     """One sentence or two, without the unit and the range that the field declares."""
     assert len(TABLE) > 100
@@ -68,14 +68,14 @@ def test_every_parameter_has_a_meaning():
     assert {path: text for path, text in texts.items() if re.search(r" \[[^\]]+\]", text)} == {}
 
 
-@killed_by("actuators/valve.py", 'default=0.0, unit="control"', 'default=0.0, unit="1"')
+@killed_by("parts.actuators.valve", 'default=0.0, unit="control"', 'default=0.0, unit="1"')
 def test_a_name_has_one_unit():
     several = {name: rows for name, rows in TABLE.items() if len({unit for unit, _, _ in rows}) > 1}
     assert {name: rows for name, rows in several.items() if name not in UNITS} == {}
     assert set(several) == set(UNITS)  # no reason stands without need
 
 
-@killed_by("actuators/lag.py", '"""Lower limit of the control."""', '"""Least value of the command."""')
+@killed_by("parts.actuators.lag", '"""Lower limit of the control."""', '"""Least value of the command."""')
 def test_a_name_has_one_meaning():
     """The first two words say what it is; the rest may say of which part."""
     heads = {
@@ -86,7 +86,7 @@ def test_a_name_has_one_meaning():
     assert set(MEANINGS) <= several
 
 
-@killed_by("controllers/torque_logic.py", "    high: Scalar", "    torque_max: Scalar")
+@killed_by("parts.controllers.torque_logic", "    high: Scalar", "    torque_max: Scalar")
 def test_a_limit_is_low_or_high():
     """The current of a motor has a greatest size; it is no control."""
     assert {unit for name in ("low", "high") for unit, _, _ in TABLE[name]} == {"control", "V"}
@@ -104,7 +104,7 @@ def test_a_list_has_the_meaning():
     assert describe_part("actuator", d.actuators.Limits())["low"]["meaning"] == "Lower limit of the control."
 
 
-@killed_by("core/meanings.py", "reversed(cls.__mro__)", "(cls,)")
+@killed_by("core.meanings", "reversed(cls.__mro__)", "(cls,)")
 def test_a_field_of_a_base_keeps_its_meaning():
     class Slower(d.actuators.Lag):
         pass
@@ -112,7 +112,7 @@ def test_a_field_of_a_base_keeps_its_meaning():
     assert field_meanings(Slower) == {"time_constant": "Time constant of the control."}
 
 
-@killed_by("core/meanings.py", "except (OSError, TypeError, SyntaxError):", "except (TypeError, SyntaxError):")
+@killed_by("core.meanings", "except (OSError, TypeError, SyntaxError):", "except (TypeError, SyntaxError):")
 def test_a_class_without_source_has_no_meanings():
     scope = {"__name__": "__main__", "pytree": pytree, "param": param, "Scalar": Scalar}
     exec('@pytree\nclass Typed:\n    """Typed in."""\n    x: Scalar = param(default=1.0, unit="m")\n', scope)

@@ -9,7 +9,6 @@ import pytest
 from mutants import killed_by
 
 import diffabs
-from diffabs.controllers import StateFeedback
 from diffabs.core.arrays import as_array
 from diffabs.core.pytree import (
     arrays,
@@ -25,11 +24,12 @@ from diffabs.core.pytree import (
     static,
 )
 from diffabs.core.validity import check_part, find_misshapen, find_problems
-from diffabs.objectives import IAE
-from diffabs.plants import MirroredRig
-from diffabs.roads import DRY_ASPHALT, SPLINE_B, MagicFormula, Patches, Scaled
-from diffabs.sensors import PlayedWheelNoise
-from diffabs.stops import SpeedReached
+from diffabs.parts.controllers import StateFeedback
+from diffabs.parts.objectives import IAE
+from diffabs.parts.plants import MirroredRig
+from diffabs.parts.roads import DRY_ASPHALT, SPLINE_B, MagicFormula, Patches, Scaled
+from diffabs.parts.sensors import PlayedWheelNoise
+from diffabs.parts.stops import SpeedReached
 
 
 @pytree
@@ -108,7 +108,7 @@ def test_check_names_every_offender_with_value_range_and_unit():
     ]
 
 
-@killed_by("core/pytree.py", " & ((abs(x) < math.inf) | self.infinite)", "")
+@killed_by("core.pytree", " & ((abs(x) < math.inf) | self.infinite)", "")
 def test_check_returns_the_part_and_allows_declared_infinities():
     pair = Pair()
     assert check_part(pair) is pair
@@ -121,7 +121,7 @@ def test_check_sees_one_bad_element_of_an_array():
         check_part(Spring(rest=np.array([0.0, np.nan])))
 
 
-@killed_by("core/validity.py", "suppress(jax.errors.JAXTypeError)", "suppress()")
+@killed_by("core.validity", "suppress(jax.errors.JAXTypeError)", "suppress()")
 def test_own_problems_of_traced_numbers():
     """Compiled, two lengths cannot be compared; a shape is known, and so is a number under `grad`."""
     said = []
@@ -142,8 +142,8 @@ def test_own_problems_have_the_path_and_wait_for_the_ranges():
     assert list(find_problems(Spring(rest=same, damping=2.0))) == ["damping = 2 is outside [0, 1)"]
 
 
-@killed_by("core/pytree.py", "tuple | list):\n        for", "tuple):\n        for", case="list")
-@killed_by("core/pytree.py", "isinstance(value, tuple | list) else", "isinstance(value, tuple) else", case="list")
+@killed_by("core.pytree", "tuple | list):\n        for", "tuple):\n        for", case="list")
+@killed_by("core.pytree", "isinstance(value, tuple | list) else", "isinstance(value, tuple) else", case="list")
 @pytest.mark.parametrize("kind", [tuple, list])
 def test_parameters_in_order_of_declaration(kind):
     pair = Pair(springs=kind(Pair().springs))
@@ -179,9 +179,9 @@ def test_wrong_path_says_what_is_there(path, message):
         assert error.value.args[0] == message
 
 
-@killed_by("core/pytree.py", "jnp.result_type(part, 0.0)", "jnp.result_type(part)", case="array0")
-@killed_by("core/pytree.py", "isinstance(part, tuple | list) or", "isinstance(part, tuple) or", case="list")
-@killed_by("core/pytree.py", "isinstance(part, tuple) or dataclasses.is_dataclass(part[i])", "True", case="array0")
+@killed_by("core.pytree", "jnp.result_type(part, 0.0)", "jnp.result_type(part)", case="array0")
+@killed_by("core.pytree", "isinstance(part, tuple | list) or", "isinstance(part, tuple) or", case="list")
+@killed_by("core.pytree", "isinstance(part, tuple) or dataclasses.is_dataclass(part[i])", "True", case="array0")
 @pytest.mark.parametrize("kind", [tuple, list, np.array, jnp.array])
 def test_a_number_replaces_one_of_several_integers(kind):
     for use in (lambda function: function, jax.jit):
@@ -212,7 +212,7 @@ def test_strong_makes_one_dtype():
         assert not any(x.weak_type for x in leaves)
 
 
-@killed_by("core/pytree.py", "{path: as_rule_array(value)", "{path: jnp.asarray(value)")
+@killed_by("core.pytree", "{path: as_rule_array(value)", "{path: jnp.asarray(value)")
 def test_every_parameter_becomes_an_array_of_one_type():
     """Also a list and an integer; what is static stays, and so does the precision of an array among them."""
     made = arrays(Pair(springs=(Spring(stiffness=3, rest=[0.0, 2.0], turns=9), Spring(damping=jnp.float32(0.25)))))
@@ -225,7 +225,7 @@ def test_every_parameter_becomes_an_array_of_one_type():
 
 
 @pytest.mark.slow
-@killed_by("core/pytree.py", "return canonical_dtypes(stack_lists(part))", "return stack_lists(part)")
+@killed_by("core.pytree", "return canonical_dtypes(stack_lists(part))", "return stack_lists(part)")
 def test_equinox_differentiates_every_parameter():
     """The reverse pass of `jax.grad`, but for what Equinox counts as differentiable: one leaf of this rig's floats."""
     filter_grad = pytest.importorskip("equinox", reason="equinox is in the group `ecosystem`").filter_grad
@@ -256,7 +256,7 @@ def test_strong_saves_a_compilation():
         assert double._cache_size() == count
 
 
-@killed_by("core/pytree.py", "tuple | list):\n        return tuple", "tuple):\n        return tuple", case="list")
+@killed_by("core.pytree", "tuple | list):\n        return tuple", "tuple):\n        return tuple", case="list")
 @pytest.mark.parametrize("kind", [tuple, list])
 def test_prepared_reaches_nested_parts_and_keeps_the_rest(kind):
     roads = kind([Scaled(road=SPLINE_B, scale=0.7), DRY_ASPHALT])
@@ -279,7 +279,7 @@ def test_prepared_is_differentiable():
 
 
 @killed_by(
-    "core/pytree.py",
+    "core.pytree",
     "    _register(new, [f.name for f in fields if f.name not in meta], meta)\n",
     "    jax.tree_util.register_dataclass(new, [f.name for f in fields if f.name not in meta], meta)\n",
 )
@@ -304,7 +304,7 @@ def test_leaves_have_the_names_of_the_fields():
     assert keys[:2] == [".springs[0].stiffness", ".springs[0].damping"]
 
 
-@killed_by("core/arrays.py", "_number(float(x), math.copysign(1.0, x), ", "_number(float(x), 1.0, ")
+@killed_by("core.arrays", "_number(float(x), math.copysign(1.0, x), ", "_number(float(x), 1.0, ")
 def test_an_array_is_made_once_of_each_number():
     """Of each type, and of 0 and -0, which are equal; within jit none is kept."""
     first, second = (canonical_dtypes([0.0, -0.0, 1.5]) for _ in range(2))

@@ -7,12 +7,13 @@ import pytest
 from mutants import killed_by
 
 import diffabs as d
-from diffabs import controllers, design, identify, linear, reach
-from diffabs.config.values import ScenarioError
+from diffabs import controllers, design, linear, reach
 from diffabs.core.renamed import RENAMED
-from diffabs.reach.verification import verify_box
+from diffabs.host.values import ScenarioError
+from diffabs.robust.reach.verification import verify_box
 from diffabs.scenario.registry import FAMILIES, family_types
 from diffabs.scenario.scenario import load
+from diffabs.tune import identify
 
 CLASSES = {type(part).__name__: type(part) for family in FAMILIES for part in family_types(family).values()}
 FUNCTIONS = (linear.lqg, design.polytope, identify.gaussian, reach.prove_box, verify_box)
@@ -20,7 +21,7 @@ OWNERS = CLASSES | {call.__name__: call for call in FUNCTIONS}
 NAMES = [(owner, old, new) for owner, names in RENAMED.items() for old, new in names.items()]
 
 
-@killed_by("core/pytree.py", "if cls.__name__ in RENAMED:", "if False:", case="Relay-torque_max-high")
+@killed_by("core.pytree", "if cls.__name__ in RENAMED:", "if False:", case="Relay-torque_max-high")
 @pytest.mark.parametrize(("owner", "old", "new"), NAMES)
 def test_a_call_with_an_old_name(owner, old, new):
     names = inspect.signature(OWNERS[owner]).parameters
@@ -34,13 +35,13 @@ def test_a_replaced_field_with_an_old_name():
         dataclasses.replace(controllers.Relay(), torque_max=1.0)
 
 
-@killed_by("core/pytree.py", "new = current_name(name, names)", "new = None")
+@killed_by("core.pytree", "new = current_name(name, names)", "new = None")
 def test_a_path_with_an_old_name():
     with pytest.raises(KeyError, match=r"no 'torque_max' in controller\.torque_max; it is now high"):
         d.replace(d.braking(controller=controllers.StateFeedback()), {"controller.torque_max": 5.0})
 
 
-@killed_by("config/values.py", "if new := current_name(str(name), names):", "if new := None:")
+@killed_by("host.values", "if new := current_name(str(name), names):", "if new := None:")
 @pytest.mark.parametrize(
     ("change", "message"),
     [

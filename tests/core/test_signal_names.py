@@ -14,8 +14,8 @@ import diffabs as d
 from diffabs import controllers, objectives, references, stops
 from diffabs.core.protocols import Memory
 from diffabs.core.pytree import param, pytree
-from diffabs.reach import RunClaim, prove_box
-from diffabs.reach.equations import derive_equations
+from diffabs.robust.reach import RunClaim, prove_box
+from diffabs.robust.reach.equations import derive_equations
 
 NAMES = ["t", "time", "target", "setpoint", "feedforward", "command", "control", "sample", "units", "metrics"]
 SOLVER = d.FixedStep(1e-2, 0.1)
@@ -82,7 +82,7 @@ def shown_as(name: str) -> d.Loop:
     return loop_of(pytree(type("Named", (Decay,), {"shows": shows}))())
 
 
-@killed_by("core/loop.py", '"metrics", "units"}', '"metrics"}', case="units")
+@killed_by("core.loop", '"metrics", "units"}', '"metrics"}', case="units")
 @pytest.mark.parametrize("name", NAMES)
 def test_an_output_with_the_name_of_a_signal_is_refused(name):
     loop, why = shown_as(name), rf"^plant.shows: no output can be called {name}, like a signal of the loop"
@@ -142,14 +142,14 @@ def test_no_command_takes_a_loop_whose_output_is_called_command(tmp_path, monkey
         assert "plant.shows: no output can be called command" in error
 
 
-@killed_by("reach/equations.py", "short.count(name) == 1", "True")
+@killed_by("robust.reach.equations", "short.count(name) == 1", "True")
 def test_states_of_one_name_keep_flow_and_held():
     """A state is looked up by its name, so a bound of the held number would pass for one of the filter."""
     equations = derive_equations(loop_of(Decay(), Twice()), ["plant.rate"])
     assert equations.states == ("plant.0", "controller.flow.x", "controller.held.x", "t")
 
 
-@killed_by("simulate/arguments.py", 'RESERVED_METRICS = ("", ', "RESERVED_METRICS = (")
+@killed_by("engine.arguments", 'RESERVED_METRICS = ("", ', "RESERVED_METRICS = (")
 @pytest.mark.parametrize("name", ["", "stopped", "diverged", "timed_out"])
 def test_a_metric_with_the_name_of_another_result_is_refused(name):
     """A table of runs has the flags as columns; an empty name is that of the plant's audit."""

@@ -6,12 +6,13 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from mutants import killed_by
 
-from diffabs import plants, plot
-from diffabs.objectives import Effort, TorqueRate, Variation
+from diffabs import plants
+from diffabs.engine.run import rollout
+from diffabs.output import plot
+from diffabs.parts.objectives import Effort, TorqueRate, Variation
 from diffabs.scenario import scenario
 from diffabs.scenario.registry import unit_of
-from diffabs.simulate.run import rollout
-from diffabs.sweep.trajectories import write_trajectories
+from diffabs.uncertainty.sweep.trajectories import write_trajectories
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
@@ -28,7 +29,7 @@ def test_a_plant_says_the_unit_of_its_control(plant, unit):
 
 @pytest.mark.slow
 @killed_by(
-    "simulate/convert.py",
+    "engine.convert",
     "control = plant.control_unit if plant is not None else",
     'control = "N m" if plant is not None else',
 )

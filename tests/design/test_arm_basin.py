@@ -10,10 +10,18 @@ from oracles import arm_rates, arm_stays_up
 from scipy.linalg import solve_continuous_are
 
 from diffabs import braking
-from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
 from diffabs.core.pytree import replace
-from diffabs.design import Polytope, Spec, certify, design
-from diffabs.design.attraction import (
+from diffabs.engine.run import measure
+from diffabs.engine.types import FixedStep
+from diffabs.linear.balance_model import BalanceModel
+from diffabs.linear.recoverable import recoverable_bound
+from diffabs.papers.arm_balance import TUNED, heaviest
+from diffabs.parts.controllers import BalanceFeedback, ObserverFeedback, Sampled
+from diffabs.parts.objectives import FinalNorm
+from diffabs.parts.plants import ArmBalance, PrintedArm
+from diffabs.parts.plants.arm_balance import ArmState
+from diffabs.robust.design import Polytope, Spec, certify, design
+from diffabs.robust.design.attraction import (
     Basin,
     Cells,
     Outcomes,
@@ -22,17 +30,9 @@ from diffabs.design.attraction import (
     recoverable_multiple,
     region_of_attraction,
 )
-from diffabs.design.capture import capture_ellipsoids
-from diffabs.design.parameter_grid import grid_polytope
-from diffabs.design.state_feedback import reduce_balance_loop
-from diffabs.linear.balance_model import BalanceModel
-from diffabs.linear.recoverable import recoverable_bound
-from diffabs.objectives import FinalNorm
-from diffabs.papers.arm_balance import TUNED, heaviest
-from diffabs.plants import ArmBalance, PrintedArm
-from diffabs.plants.arm_balance import ArmState
-from diffabs.simulate.run import measure
-from diffabs.simulate.types import FixedStep
+from diffabs.robust.design.capture import capture_ellipsoids
+from diffabs.robust.design.parameter_grid import grid_polytope
+from diffabs.robust.design.state_feedback import reduce_balance_loop
 
 OVER = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (700.0, 1300.0), "plant.damping": (70.0, 130.0)}
 
@@ -65,7 +65,9 @@ def test_a_region_is_what_its_runs_do():
     assert not np.array_equal(found.outcomes.recovered[:5], found.outcomes.recovered[:5][::-1])
 
 
-@killed_by("design/attraction.py", "inside.contain(x) & ~run.stopped & ~run.diverged", "~run.stopped & ~run.diverged")
+@killed_by(
+    "robust.design.attraction", "inside.contain(x) & ~run.stopped & ~run.diverged", "~run.stopped & ~run.diverged"
+)
 @pytest.mark.slow
 def test_a_timeout_is_undecided():
     """The slow LQR after 3 s: neither on the ground nor where it surely returns. In the end 32.8 % return, not 23.0."""
@@ -109,7 +111,9 @@ def test_starts_beside_the_border_end_as_scipy_says(gain):
 
 
 @killed_by(
-    "design/attraction.py", "(np.arange(self.number) + 0.5) / self.number", "np.arange(self.number) / (self.number - 1)"
+    "robust.design.attraction",
+    "(np.arange(self.number) + 0.5) / self.number",
+    "np.arange(self.number) / (self.number - 1)",
 )
 def test_a_share_is_one_by_area():
     """Cells, so that the border counts half: of theta > phi the half, of which a grid with its edges makes 0.45."""
@@ -133,8 +137,8 @@ def test_the_largest_multiple_that_is_recovered(voltage):
     assert not arm_stays_up(HANGING, GAIN, (found.multiple + 1e-4) * START, voltage)
 
 
-@killed_by("design/attraction.py", "if not 0 < band < np.inf:", "if False:")
-@killed_by("design/attraction.py", "if not 0 < largest < np.inf:", "if False:")
+@killed_by("robust.design.attraction", "if not 0 < band < np.inf:", "if False:")
+@killed_by("robust.design.attraction", "if not 0 < largest < np.inf:", "if False:")
 def test_no_band_and_no_search_without_a_size():
     for band in (0.0, -0.1, np.nan):
         with pytest.raises(ValueError, match=rf"band = {band:g} is outside \(0, inf\)"):
@@ -233,7 +237,7 @@ CASES = {
 
 
 @pytest.mark.slow
-@killed_by("design/capture.py", "_growth(systems, p, inverse, level) < decay", "np.ones(len(p), bool)")
+@killed_by("robust.design.capture", "_growth(systems, p, inverse, level) < decay", "np.ones(len(p), bool)")
 @pytest.mark.parametrize("case", CASES)
 def test_in_the_ellipsoid_its_function_falls(case):
     """At 4,000 states in and on it, in separately written equations with the limit; on it the motor is linear. It is
@@ -253,7 +257,7 @@ def test_in_the_ellipsoid_its_function_falls(case):
 
 
 @pytest.mark.slow
-@killed_by("design/capture.py", "1 / reach.max(axis=1)", "np.full(len(p), 1e9)")
+@killed_by("robust.design.capture", "1 / reach.max(axis=1)", "np.full(len(p), 1e9)")
 def test_no_ellipsoid_where_the_loop_does_not_return():
     """A rider of 72 kg falls, slowly; NaN is no gain; an unlimited motor and a current limit change what is linear."""
     masses = np.array([70.0, 72.0])
@@ -272,7 +276,7 @@ def test_no_ellipsoid_where_the_loop_does_not_return():
 
 
 @killed_by(
-    "plants/arm_balance.py",
+    "parts.plants.arm_balance",
     "rider = self.gravity * b3 * extent(unit[0] + unit[2]) ** 3 / 6",
     "rider = 0.0 * extent(unit[0] + unit[2])",
 )
@@ -324,7 +328,7 @@ def test_float32_and_float64_agree_on_the_region():
     assert 0.2 < double.share < 0.8
 
 
-@killed_by("stops/stops.py", "return self.angle**2 - output.theta**2", "return self.angle**2 - output.psi**2")
+@killed_by("parts.stops.stops", "return self.angle**2 - output.theta**2", "return self.angle**2 - output.psi**2")
 @pytest.mark.slow
 def test_the_slope_of_the_time_of_a_fall_is_a_difference():
     """In the lean that it starts with: the last step ends on the ground, wherever that is between two instants."""
@@ -352,7 +356,7 @@ def robust():
 
 
 @killed_by(
-    "design/parameter_box.py",
+    "robust.design.parameter_box",
     "np.linspace(low[path], high[path], points)",
     "np.linspace(low[path], high[path], points, endpoint=False)",
 )
@@ -382,7 +386,7 @@ def test_one_gain_for_all_riders_is_proved(robust):
     assert all(np.linalg.eigvals(a + b @ robust.gain).real.max() < 0 for a, b in zip(finer.A, finer.B, strict=True))
 
 
-@killed_by("design/bounds.py", "definite_weight(q + self.k.T @ r @ self.k, 1e-9)", "q + self.k.T @ r @ self.k")
+@killed_by("robust.design.bounds", "definite_weight(q + self.k.T @ r @ self.k, 1e-9)", "q + self.k.T @ r @ self.k")
 def test_angles_alone_may_have_a_weight():
     """The cost of SciPy's Riccati solution; Q + K'RK has rank 4 of 6 there, and 2 with one angle."""
     a, b = map(np.asarray, model(HANGING))

@@ -19,12 +19,12 @@ from mutants import killed_by
 from project import ROOT
 from seams import replace_seam
 
-from diffabs.design.analysis import certify
-from diffabs.design.polytopes import Polytope, Schedule
-from diffabs.design.proof import exact
-from diffabs.design.proof.certificate import Certificate, Claim
-from diffabs.design.spec import L2Gain, Spec
-from diffabs.design.verify import verify_file
+from diffabs.robust.design.analysis import certify
+from diffabs.robust.design.polytopes import Polytope, Schedule
+from diffabs.robust.design.proof import exact
+from diffabs.robust.design.proof.certificate import Certificate, Claim
+from diffabs.robust.design.spec import L2Gain, Spec
+from diffabs.robust.design.verify import verify_file
 
 OUTSIDERS = ROOT / "tests" / "support" / "check_certificate.py"
 spec = importlib.util.spec_from_file_location("check_certificate", OUTSIDERS)
@@ -758,9 +758,9 @@ def test_large_files_and_systems_are_refused(tmp_path):
         Certificate.load(tmp_path / "x.json")
 
 
-@killed_by("design/proof/serialise.py", "max(cell.order, cell.inputs) >", "cell.order + cell.inputs >")
-@killed_by("design/proof/serialise.py", "max(nodes, len(arrays), *(", "max(nodes, *(")
-@killed_by("design/proof/serialise.py", "if len(content) > MAX_CERTIFICATE_BYTES:", "if False:")
+@killed_by("robust.design.proof.serialise", "max(cell.order, cell.inputs) >", "cell.order + cell.inputs >")
+@killed_by("robust.design.proof.serialise", "max(nodes, len(arrays), *(", "max(nodes, *(")
+@killed_by("robust.design.proof.serialise", "if len(content) > MAX_CERTIFICATE_BYTES:", "if False:")
 def test_what_is_saved_is_read_by_both_readers(tmp_path):
     """Up to 64 states and 64 inputs; what a reader refuses is not written."""
 
@@ -798,7 +798,7 @@ def test_claims_that_do_not_fit_the_time_are_refused():
         Certificate(scalar(0.5, 0.1), [[0.0]], (Claim("damping", {"P": [[1.0]], "zeta": 0.1, "cot": 0.2}),))
 
 
-@killed_by("design/proof/certificate.py", "{name} {value!r}", "{name} {value:.6g}")
+@killed_by("robust.design.proof.certificate", "{name} {value!r}", "{name} {value:.6g}")
 def test_what_a_certificate_says():
     P, _ = lyapunov(-20.0, -8.0)
     good, wrong = Claim("decay", {"P": P, "rate": 0.01}), Claim("decay", {"P": P, "rate": 1e4})
@@ -835,9 +835,9 @@ def test_costs_are_rounded_up_and_only_claimed_until_proved():
     assert discrete.decay_rate == -np.log(0.6) / 0.1
 
 
-@killed_by("design/spec.py", "if find_value_objection(value) or np.ndim(value):", "if False:", case="text")
-@killed_by("design/spec.py", "np.shape(rates) != (2,)", "False", case="one rate")
-@killed_by("design/spec.py", "if not scheduled:", "if False:", case="of a polytope")
+@killed_by("robust.design.spec", "if find_value_objection(value) or np.ndim(value):", "if False:", case="text")
+@killed_by("robust.design.spec", "np.shape(rates) != (2,)", "False", case="one rate")
+@killed_by("robust.design.spec", "if not scheduled:", "if False:", case="of a polytope")
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -857,8 +857,8 @@ def test_a_specification_says_what_does_not_fit(given, message):
         Spec(**given).check(1, 1)
 
 
-@killed_by("design/analysis.py", "if unstable := self._refute_by_vertex():", "if unstable := None:")
-@killed_by("design/instability.py", "max(0.0, (low + high) / 2)", "0.0", case="None")
+@killed_by("robust.design.analysis", "if unstable := self._refute_by_vertex():", "if unstable := None:")
+@killed_by("robust.design.instability", "max(0.0, (low + high) / 2)", "0.0", case="None")
 @pytest.mark.parametrize("period", [None, 0.1])
 def test_a_growing_mode_of_one_vertex_disproves_stability(period, tmp_path):
     """Whatever the other modes and vertices are, and in any units; the growth is 5 % a period, or 0.05 1/s."""
@@ -886,8 +886,8 @@ def test_a_sum_of_states_that_stays_disproves_stability():
     assert both(found.system, found.gain, "unstable", **found.claims[0].data)
 
 
-@killed_by("design/proof/exact.py", 'yield Inequality((-(row @ data["P"] @ row.mT),))', "pass")
-@killed_by("design/verify.py", 'd["x"]]))[0][0] < 0', 'd["x"]]))[0][0] < 9')
+@killed_by("robust.design.proof.exact", 'yield Inequality((-(row @ data["P"] @ row.mT),))', "pass")
+@killed_by("robust.design.verify", 'd["x"]]))[0][0] < 0', 'd["x"]]))[0][0] < 9')
 @pytest.mark.parametrize(
     ("a", "period", "data", "proved"),
     [
@@ -922,7 +922,7 @@ def is_stable(loop, *, discrete):
 
 
 @pytest.mark.slow
-@killed_by("design/sdp/scaling.py", 'warnings.simplefilter("ignore", RuntimeWarning)', "pass")
+@killed_by("robust.design.sdp.scaling", 'warnings.simplefilter("ignore", RuntimeWarning)', "pass")
 @pytest.mark.parametrize("discrete", [False, True], ids=["continuous", "discrete"])
 def test_ill_conditioned_loops_are_right_or_undecided(discrete):
     """Of condition 1e12, with gains that nearly cancel, in units far apart, and down to 1e-12 from the edge."""

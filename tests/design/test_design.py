@@ -18,9 +18,9 @@ from scipy.linalg import (
 )
 from seams import replace_seam
 
-from diffabs.design import DesignError, InputLimit, L2Gain, Polytope, Schedule, Spec, certify, design, synthesis
-from diffabs.design.proof.exact import he
-from diffabs.design.sdp import solver as lmi
+from diffabs.robust.design import DesignError, InputLimit, L2Gain, Polytope, Schedule, Spec, certify, design, synthesis
+from diffabs.robust.design.proof.exact import he
+from diffabs.robust.design.sdp import solver as lmi
 
 BETA, ALPHAS = 133.472842636189, (83.8796606703, 84.6321445666)  # at 5.3 and 6.2 kg
 FAST, SLOW = 140.291806958, 14.0291806958  # rad/s at 50 and 5 km/h
@@ -100,7 +100,7 @@ def test_where_unscaled_solvers_return_a_destabilising_gain():
     np.testing.assert_allclose(found.gain[0], [-11747.5, -187.25], rtol=1e-3)
 
 
-@killed_by("design/sdp/program.py", "spent = [self.root @ x @ even,", "spent = [0 * self.root @ x @ even,")
+@killed_by("robust.design.sdp.program", "spent = [self.root @ x @ even,", "spent = [0 * self.root @ x @ even,")
 def test_one_vertex_is_the_closed_form_over_ten_decades():
     random = np.random.default_rng(1)
     for q1, q2, r in 10.0 ** random.uniform(-5, 5, (24, 3)):
@@ -111,7 +111,7 @@ def test_one_vertex_is_the_closed_form_over_ten_decades():
         np.testing.assert_allclose(found.lower_bound, trace, rtol=1e-9)
 
 
-@killed_by("design/sdp/program.py", "self.weight = weight / np.trace(weight)", "self.weight = np.eye(n) / n")
+@killed_by("robust.design.sdp.program", "self.weight = weight / np.trace(weight)", "self.weight = np.eye(n) / n")
 def test_four_vertices_agree_with_the_program_by_hand():
     random = np.random.default_rng(2)
     for q1, q2, r in 10.0 ** np.stack([random.uniform(0, 6, 8), random.uniform(0, 4, 8), random.uniform(-1, 1, 8)], 1):
@@ -171,7 +171,7 @@ def test_published_gain_has_no_common_lyapunov_matrix():
 
 
 @killed_by(
-    "design/sdp/scaling.py",
+    "robust.design.sdp.scaling",
     "whole = self.inverse.T @ p @ self.inverse",
     "whole = self.T.T @ p @ self.T",
     case="-76.7-True",
@@ -272,9 +272,11 @@ INTEGRATORS = np.diag([1.0, 1.0, 1.0], 1) - np.diag([0.0, 0.0, 0.0, 1.0])  # of 
 PUSH = np.eye(4)[:, 3:]
 
 
-@killed_by("design/sdp/scaling.py", "1e-6 * (values[-1] or 1.0)", "1e-12 * (values[-1] or 1.0)")
-@killed_by("design/scheduled.py", "frame.weight(definite_weight(weight + each, 1e-9))", "frame.weight(weight + each)")
-@killed_by("design/synthesis.py", "is not None else 10 * GAP", "is not None else 1e-4 * GAP", case="None")
+@killed_by("robust.design.sdp.scaling", "1e-6 * (values[-1] or 1.0)", "1e-12 * (values[-1] or 1.0)")
+@killed_by(
+    "robust.design.scheduled", "frame.weight(definite_weight(weight + each, 1e-9))", "frame.weight(weight + each)"
+)
+@killed_by("robust.design.synthesis", "is not None else 10 * GAP", "is not None else 1e-4 * GAP", case="None")
 @pytest.mark.parametrize("period", [None, 0.1])
 def test_a_weight_on_one_state_alone_has_a_cost(period):
     """Q + K'RK is singular there; a design for one system is SciPy's Riccati solution."""
@@ -294,8 +296,8 @@ def test_a_weight_on_one_state_alone_has_a_cost(period):
         np.testing.assert_allclose(scheduled.guaranteed_cost, trace, rtol=1e-5)
 
 
-@killed_by("design/sdp/scaling.py", "(values[-1] or 1.0)", "values[-1]")
-@killed_by("design/sdp/scaling.py", "push.any() and q.any()", "push.any()")
+@killed_by("robust.design.sdp.scaling", "(values[-1] or 1.0)", "values[-1]")
+@killed_by("robust.design.sdp.scaling", "push.any() and q.any()", "push.any()")
 def test_without_a_state_weight_a_stable_loop_costs_nothing():
     """And for x' = x + u the least effort has the gain -2 and the cost 2."""
     nothing = certify((0.0,), Polytope([[[-1.0]]], [[[1.0]]]), Spec(Q=(0.0,), R=1.0))
@@ -311,7 +313,7 @@ def frequency_response(closed, b, c, d, gain, count=20001):
     return np.linalg.norm((c + d @ gain) @ resolvent @ b, ord=2, axis=(1, 2)).max()
 
 
-@killed_by("design/bounds.py", "z = l2.output + l2.feedthrough @ self.k", "z = l2.output")
+@killed_by("robust.design.bounds", "z = l2.output + l2.feedthrough @ self.k", "z = l2.output")
 def test_l2_gain_of_one_system_is_its_frequency_peak():
     gain, c, d = np.array([[-1000.0, -30.0]]), np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [0.003]])
     peak = frequency_response(ONE.closed_loop(gain)[0], ONE.B[0], c, d, gain)
@@ -319,8 +321,8 @@ def test_l2_gain_of_one_system_is_its_frequency_peak():
     assert peak * (1 - 1e-6) < found < peak * (1 + 1e-4)
 
 
-@killed_by("design/spec.py", "e.ndim == 2 and len(e) == order", "e.ndim == 2")
-@killed_by("design/spec.py", "return array if array.ndim > 1 else array.reshape(", "return array.reshape(")
+@killed_by("robust.design.spec", "e.ndim == 2 and len(e) == order", "e.ndim == 2")
+@killed_by("robust.design.spec", "return array if array.ndim > 1 else array.reshape(", "return array.reshape(")
 def test_l2_matrices_are_taken_as_they_are():
     """A transposed matrix has the right number of entries, and is another system; vectors and numbers have one reading.
     The gain of a gain K = 0 is |C (i w - A)^-1 E + D|."""
@@ -365,7 +367,7 @@ def switched(system, gain, count=40, seed=0, steps=400, h=5e-4):
     return np.stack(states, 1)
 
 
-@killed_by("design/sdp/program.py", "limit.limit * (1 - SPECIFICATION_TIGHTENING)", "3 * limit.limit")
+@killed_by("robust.design.sdp.program", "limit.limit * (1 - SPECIFICATION_TIGHTENING)", "3 * limit.limit")
 def test_guarantees_hold_while_the_system_switches():
     limit, q, r = 9.03 - 2.8, np.diag([1e6, 1e4]), 1.0
     spec = Spec(Q=q, R=r, decay=3.0, input=InputLimit(limit, [START]))
@@ -386,9 +388,9 @@ def test_guarantees_hold_while_the_system_switches():
     assert (spent <= START @ p["cost"] @ START * 1.001).all()
 
 
-@killed_by("design/sdp/program.py", "return drift - he(flow) - 2 * rate * x", "return drift - he(flow) - rate * x")
+@killed_by("robust.design.sdp.program", "return drift - he(flow) - 2 * rate * x", "return drift - he(flow) - rate * x")
 @killed_by(
-    "design/sdp/program.py",
+    "robust.design.sdp.program",
     "-symmetric_from_blocks([[he(flow)], [-skew, he(flow)]])",
     "-symmetric_from_blocks([[he(flow)], [0 * skew, he(flow)]])",
 )
@@ -433,8 +435,8 @@ MISSED = {
 }
 
 
-@killed_by("design/synthesis.py", "l2_gain > bound", "False", case="L2 gain")
-@killed_by("design/synthesis.py", "np.any(limit > allowed)", "False", case="input")
+@killed_by("robust.design.synthesis", "l2_gain > bound", "False", case="L2 gain")
+@killed_by("robust.design.synthesis", "np.any(limit > allowed)", "False", case="input")
 @pytest.mark.parametrize("name", MISSED)
 def test_a_gain_that_misses_a_bound_is_refused(name):
     system, given, said = MISSED[name]
@@ -466,7 +468,7 @@ def test_one_discrete_vertex_is_the_riccati_solution():
     np.testing.assert_allclose(found.lower_bound, np.trace(p), rtol=1e-9)
 
 
-@killed_by("design/synthesis.py", "ROUGH_GAP = 1e-4", "ROUGH_GAP = 1e-12")
+@killed_by("robust.design.synthesis", "ROUGH_GAP = 1e-4", "ROUGH_GAP = 1e-12")
 def test_a_period_of_a_millisecond_leaves_fewer_digits():
     """With a small weight on a third state, the torque of the last sample."""
     system = sampled(RIG)
@@ -480,7 +482,7 @@ def test_a_period_of_a_millisecond_leaves_fewer_digits():
     assert found.certificate.verified_exactly
 
 
-@killed_by("design/analysis.py", "w = t @ w @ t.T / sizes[:, None, None]", "w = w / sizes[:, None, None]")
+@killed_by("robust.design.analysis", "w = t @ w @ t.T / sizes[:, None, None]", "w = w / sizes[:, None, None]")
 def test_discrete_design_and_proofs():
     system = sampled(RIG)
     found = design(system, Spec(Q=(1e3, 10.0), R=1e-3, decay=8.0))
@@ -495,7 +497,9 @@ def test_discrete_design_and_proofs():
 
 
 @killed_by(
-    "design/bounds.py", "return math.exp(-2 * rate) * p - c.T @ p @ c", "return math.exp(-2 * rate) * p - c @ p @ c.T"
+    "robust.design.bounds",
+    "return math.exp(-2 * rate) * p - c.T @ p @ c",
+    "return math.exp(-2 * rate) * p - c @ p @ c.T",
 )
 def test_discrete_analysis_of_one_system():
     system, gain = sampled(ONE), np.array([[-1000.0, -30.0]])
@@ -531,7 +535,7 @@ def form(proof, speed):
     return np.array([[np.interp(speed, nodes, p[:, i, j]) for j in range(2)] for i in range(2)])
 
 
-@killed_by("design/scheduled.py", "common = drift * (end - start)", "common = 0 * drift * (end - start)")
+@killed_by("robust.design.scheduled", "common = drift * (end - start)", "common = 0 * drift * (end - start)")
 @pytest.mark.slow
 def test_published_gain_is_proved_for_a_speed_that_cannot_jump():
     proof = certify((-11753.0, -48.0), chain(), Spec(rates=RATES, decay=5.0))
@@ -551,7 +555,7 @@ def test_published_gain_is_proved_for_a_speed_that_cannot_jump():
         before = after
 
 
-@killed_by("design/scheduled.py", "Spec(Q=spec.Q, R=spec.R, rates=spec.rates)", "spec")
+@killed_by("robust.design.scheduled", "Spec(Q=spec.Q, R=spec.R, rates=spec.rates)", "spec")
 def test_the_cost_of_a_schedule_does_not_depend_on_its_decay():
     """A constant system with the cost of its Lyapunov equation; its poles decay at 1/2 per second."""
     a, b, gain = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], np.array([[-1.0, -1.0]])
@@ -564,7 +568,7 @@ def test_the_cost_of_a_schedule_does_not_depend_on_its_decay():
         assert found.verified_exactly
 
 
-@killed_by("design/synthesis.py", "(proof.decay_rate or 0.0) >= spec.decay", "True")
+@killed_by("robust.design.synthesis", "(proof.decay_rate or 0.0) >= spec.decay", "True")
 def test_a_scheduled_gain_without_its_decay_is_refused(monkeypatch):
     """Of each attempt's three programs the last one, of the decay, has no answer."""
     honest, calls = lmi.solve_sdp, itertools.cycle((1.0, 1.0, np.nan))
@@ -575,7 +579,7 @@ def test_a_scheduled_gain_without_its_decay_is_refused(monkeypatch):
 
 
 @killed_by(
-    "design/scheduled.py", "first = cost if cost and spec.decay == 0 else", "first = cost if spec.decay == 0 else"
+    "robust.design.scheduled", "first = cost if cost and spec.decay == 0 else", "first = cost if spec.decay == 0 else"
 )
 def test_a_schedule_without_a_proved_cost_may_be_stable(monkeypatch):
     """The first program, of the cost, has no answer."""
@@ -588,7 +592,7 @@ def test_a_schedule_without_a_proved_cost_may_be_stable(monkeypatch):
 
 
 @pytest.mark.slow
-@killed_by("design/sdp/program.py", "slope = rate / width / frame.tau", "slope = 0.0 * rate / width / frame.tau")
+@killed_by("robust.design.sdp.program", "slope = rate / width / frame.tau", "slope = 0.0 * rate / width / frame.tau")
 def test_scheduled_gain():
     system = chain(6)
     found = design(system, Spec(Q=(K1**2, 1.0), R=1.0, rates=RATES))
@@ -604,10 +608,10 @@ def test_scheduled_gain():
 # what is refused
 
 
-@killed_by("design/bounds.py", "1 + 1e-9) * math.sqrt(more *", "1 + 0) * math.sqrt(more *")
-@killed_by("design/analysis.py", "max(factor, self.least_factor)", "factor")
-@killed_by("design/analysis.py", "sizes += 1.0 if self.discrete else sizes == 0", "sizes += float(self.discrete)")
-@killed_by("design/analysis.py", "high = min(high, middle)", "pass")
+@killed_by("robust.design.bounds", "1 + 1e-9) * math.sqrt(more *", "1 + 0) * math.sqrt(more *")
+@killed_by("robust.design.analysis", "max(factor, self.least_factor)", "factor")
+@killed_by("robust.design.analysis", "sizes += 1.0 if self.discrete else sizes == 0", "sizes += float(self.discrete)")
+@killed_by("robust.design.analysis", "high = min(high, middle)", "pass")
 def test_deadbeat_loops_and_zero_loops_have_an_answer():
     """Zero after n periods: every decay holds, and the cost is the sum of the first n terms."""
     for size in (1.0, 1e4, 1e-3):
@@ -726,7 +730,7 @@ def tampered(change):
 
 
 @killed_by(
-    "design/synthesis.py",
+    "robust.design.synthesis",
     "    missing -= {claim.kind for claim in proof.claims}\n",
     '    return ""\n    missing -= {claim.kind for claim in proof.claims}\n',
     case="larger Z",
@@ -766,7 +770,7 @@ def test_gap_and_violation():
     assert answer._replace(y=np.array([0.4])).violation(blocks) > 0.02
 
 
-@killed_by("design/sdp/solver.py", " + float(np.abs(c - gradient) @ np.abs(self.y))", "")
+@killed_by("robust.design.sdp.solver", " + float(np.abs(c - gradient) @ np.abs(self.y))", "")
 def test_a_gap_counts_what_the_multipliers_leave():
     """Multipliers that do not balance the objective prove nothing: the optimum of the toy program is 1/2."""
     unknowns = lmi.Unknowns(y=(1, 1))
@@ -788,7 +792,7 @@ def test_unknowns_pack_and_unpack():
 @pytest.mark.slow
 def test_importing_loads_no_solver():
     heavy = "{'cvxpy', 'clarabel', 'scipy.optimize', 'matplotlib'}"
-    program = f"import sys, diffabs, diffabs.design; sys.exit(bool({heavy} & set(sys.modules)))"
+    program = f"import sys, diffabs, diffabs.robust.design; sys.exit(bool({heavy} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", program]).returncode == 0
 
 

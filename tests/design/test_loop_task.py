@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from mutants import killed_by
 
-from diffabs.design import findings
-from diffabs.design.loop_task import greatest_decelerations
-from diffabs.plants import RoadVehicle
-from diffabs.roads import MagicFormula
+from diffabs.parts.plants import RoadVehicle
+from diffabs.parts.roads import MagicFormula
+from diffabs.robust.design import findings
+from diffabs.robust.design.loop_task import greatest_decelerations
 
 
-@killed_by("design/loop_task.py", "MARGIN * np.max(", "np.max(")
-@killed_by("design/loop_task.py", "jnp.max(every", "jnp.min(every")
-@killed_by("design/loop_task.py", "itertools.product(*inside.values())", "[[ends[1] for ends in inside.values()]]")
+@killed_by("robust.design.loop_task", "MARGIN * np.max(", "np.max(")
+@killed_by("robust.design.loop_task", "jnp.max(every", "jnp.min(every")
+@killed_by("robust.design.loop_task", "itertools.product(*inside.values())", "[[ends[1] for ends in inside.values()]]")
 def test_the_lightest_vehicle_brakes_hardest() -> None:
     """The peak of friction, with air drag and rolling resistance, and 1 % more."""
     speeds = np.array([5.0, 55.0])
@@ -24,8 +24,8 @@ def test_the_lightest_vehicle_brakes_hardest() -> None:
     np.testing.assert_allclose(bounds, 1.01 * exact, rtol=1e-4)
 
 
-@killed_by("design/findings.py", "if not 0 < low < high or task", "if task")
-@killed_by("design/findings.py", " or task.polytope.period is not None", "")
+@killed_by("robust.design.findings", "if not 0 < low < high or task", "if task")
+@killed_by("robust.design.findings", " or task.polytope.period is not None", "")
 @pytest.mark.parametrize(("over", "period"), [({}, None), ({"speed": (5.0, 5.0)}, None), ({"speed": (5.0, 9.0)}, 1e-3)])
 def test_a_sampled_loop_or_one_speed_has_no_permitted_fall(
     over: dict[str, tuple[float, float]], period: float | None, monkeypatch: pytest.MonkeyPatch

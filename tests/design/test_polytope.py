@@ -10,16 +10,16 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 from seams import replace_seam
 
-from diffabs.actuators import Lag
 from diffabs.core.pytree import param, pytree, replace
-from diffabs.design.frozen import analyse_frozen_loops
-from diffabs.design.parameter_box import polytope, schedule
-from diffabs.design.parameter_grid import grid_polytope
-from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.linear.linearization import StateSpace
 from diffabs.linear.slip_model import Sampling, SlipModel
-from diffabs.plants import MirroredRig
-from diffabs.roads import RIG, SPLINE_B, Scaled
+from diffabs.parts.actuators import Lag
+from diffabs.parts.plants import MirroredRig
+from diffabs.parts.roads import RIG, SPLINE_B, Scaled
+from diffabs.robust.design.frozen import analyse_frozen_loops
+from diffabs.robust.design.parameter_box import polytope, schedule
+from diffabs.robust.design.parameter_grid import grid_polytope
+from diffabs.robust.design.polytopes import Polytope, Schedule
 
 K = 1 / 3.6
 MASS, SPEED = (5.3, 6.2), (5 * K, 50 * K)
@@ -226,8 +226,8 @@ def test_no_parameter_and_equal_ends():
     np.testing.assert_allclose(single.A[0, 1, 1], 84.6321445666 / (5 * K / 0.099), rtol=1e-10)
 
 
-@killed_by("design/parameter_grid.py", "data, labels, model", "data, labels, _")
-@killed_by("design/frozen.py", "data, labels, model", "data, labels, _")
+@killed_by("robust.design.parameter_grid", "data, labels, model", "data, labels, _")
+@killed_by("robust.design.frozen", "data, labels, model", "data, labels, _")
 def test_a_period_fixed_by_the_box_is_that_of_the_systems():
     over = {"sampling.period": (4e-3, 4e-3)}
     slower = replace(SAMPLED, {"sampling.period": 4e-3})
@@ -308,7 +308,7 @@ def test_errors(model, over, message):
         polytope(model, over)
 
 
-@killed_by("design/polytopes.py", "not 0 < self.period < math.inf", "not self.period < math.inf", case="-1.0")
+@killed_by("robust.design.polytopes", "not 0 < self.period < math.inf", "not self.period < math.inf", case="-1.0")
 @pytest.mark.parametrize("period", [-1.0, 0.0, np.nan, np.inf])
 def test_a_period_that_is_not_positive_is_refused(period):
     with pytest.raises(ValueError, match=rf"period = {period:g} is outside \(0, inf\) s"):

@@ -9,13 +9,13 @@ import pytest
 from mutants import killed_by
 from seams import replace_seam
 
-from diffabs.design import Polytope, Spec, certify, design
-from diffabs.design.interior.decay_rate import certified_decay
-from diffabs.design.interior.differentiable import robust_design, robust_gain
-from diffabs.design.sdp import solver
-from diffabs.design.sdp.program import DesignProgram
-from diffabs.design.sdp.scaling import design_frames
 from diffabs.linear.riccati import care
+from diffabs.robust.design import Polytope, Spec, certify, design
+from diffabs.robust.design.interior.decay_rate import certified_decay
+from diffabs.robust.design.interior.differentiable import robust_design, robust_gain
+from diffabs.robust.design.sdp import solver
+from diffabs.robust.design.sdp.program import DesignProgram
+from diffabs.robust.design.sdp.scaling import design_frames
 
 BETA, ALPHAS = 133.472842636189, (83.8796606703, 84.6321445666)  # as in test_design
 FAST, SLOW = 140.291806958, 14.0291806958
@@ -79,18 +79,18 @@ def agrees(system, weights, tolerance):
 
 
 @killed_by(
-    "design/interior/differentiable.py",
+    "robust.design.interior.differentiable",
     "step = -central_path.solve_newton_system(hessian, by_problem)",
     "step = central_path.solve_newton_system(hessian, by_problem)",
     case="ones",
 )
 @killed_by(
-    "design/interior/central_path.py",
+    "robust.design.interior.central_path",
     '2 * jnp.einsum("ij,abji->ba", total, curved)',
     '0 * jnp.einsum("ij,abji->ba", total, curved)',
     case="ones",
 )
-@killed_by("design/interior/differentiable.py", "FINAL_MU = 1e-8", "FINAL_MU = 1e-3", case="ones")
+@killed_by("robust.design.interior.differentiable", "FINAL_MU = 1e-8", "FINAL_MU = 1e-3", case="ones")
 @pytest.mark.parametrize(
     "weights",
     [pytest.param(w, id=name, marks=pytest.mark.slow if name != "middle" else ()) for name, w in PUBLISHED.items()],
@@ -145,7 +145,7 @@ def test_cost_obeys_the_envelope_theorem():
         np.testing.assert_allclose(by_cost[:2], np.diag(x) * (q1, q2), rtol=1e-4)
 
 
-@killed_by("design/interior/central_path.py", "1e-3 * jnp.abs(first) + rounding", "1e-3 * jnp.abs(first) + 1e-30")
+@killed_by("robust.design.interior.central_path", "1e-3 * jnp.abs(first) + rounding", "1e-3 * jnp.abs(first) + 1e-30")
 @pytest.mark.slow
 def test_one_vertex_is_the_riccati_equation():
     q1, q2, r, a = 1e6, 1e4, 2.0, ALPHAS[0] / BETA
@@ -234,7 +234,7 @@ GAINS = ((-11753.0, -158.17), (-999.7, -111.07), (-0.834, -2.599))
 
 
 @pytest.mark.slow
-@killed_by("design/interior/decay_rate.py", "SHIFT_GAP = 1e-8", "SHIFT_GAP = 1e-2", case="gain0-continuous")
+@killed_by("robust.design.interior.decay_rate", "SHIFT_GAP = 1e-8", "SHIFT_GAP = 1e-2", case="gain0-continuous")
 @both_times
 @pytest.mark.parametrize("gain", GAINS)
 def test_decay_is_what_can_be_proved(gain, system):
@@ -246,7 +246,7 @@ def test_decay_is_what_can_be_proved(gain, system):
 
 @pytest.mark.slow
 @killed_by(
-    "design/interior/decay_rate.py",
+    "robust.design.interior.decay_rate",
     "2 * jnp.sum(weights * derivative)",
     "2 * jnp.sum(jnp.mean(weights, 0) * derivative)",
     case="continuous",
@@ -280,8 +280,8 @@ def test_decay_of_one_system_is_that_of_its_slowest_mode():
 CHAIN = {n: (jnp.eye(n, k=1)[None], jnp.eye(n)[None, :, -1:]) for n in (1, 2, 3)}  # companion matrices with K below
 
 
-@killed_by("design/interior/decay_rate.py", "jnp.where(possible, new, old)", "new")
-@killed_by("design/interior/decay_rate.py", "path.settled >= FINAL_CENTRE_STEPS, jnp", "path.settled >= 0, jnp")
+@killed_by("robust.design.interior.decay_rate", "jnp.where(possible, new, old)", "new")
+@killed_by("robust.design.interior.decay_rate", "path.settled >= FINAL_CENTRE_STEPS, jnp", "path.settled >= 0, jnp")
 def test_decay_at_a_multiple_pole_is_just_below_it():
     """(s + p)^n, or (z - p)^n: no P proves the rate of the pole itself."""
     at_poles = (((-1.0, -2.0), 1.0), ((-4.0, -4.0), 2.0), ((-1e4, -200.0), 100.0), ((0.0, 0.0), 0.0))
@@ -298,7 +298,9 @@ def test_decay_at_a_multiple_pole_is_just_below_it():
     np.testing.assert_allclose(rate, 1 + near / 2 - np.sqrt(near + near**2 / 4), rtol=1e-8)
 
 
-@killed_by("design/interior/decay_rate.py", "(s * jnp.abs(jnp.log(s)), jnp.minimum(size, s))", "(jnp.abs(s - 1), size)")
+@killed_by(
+    "robust.design.interior.decay_rate", "(s * jnp.abs(jnp.log(s)), jnp.minimum(size, s))", "(jnp.abs(s - 1), size)"
+)
 def test_decay_of_a_fast_sampled_loop_is_that_of_its_pole():
     for pole in (0.9, 1e-2, 1e-3, 1e-5, 1e-12):
         rate, slope = decay(jnp.array([pole]), *CHAIN[1], 0.5)

@@ -19,9 +19,9 @@ from mutants import killed_by
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
 from diffabs.cli import design
-from diffabs.design import verify
-from diffabs.design.polytopes import Polytope, Schedule
-from diffabs.design.proof.certificate import Certificate, Claim
+from diffabs.robust.design import verify
+from diffabs.robust.design.polytopes import Polytope, Schedule
+from diffabs.robust.design.proof.certificate import Certificate, Claim
 
 C = np.array([[-1.0, 2.0], [-2.0, -1.0]])  # poles -1 +- 2j, damping 1/sqrt(5) = 0.447
 STEP = np.array([[0.5, 0.2], [-0.2, 0.5]])  # radius sqrt(0.29) = 0.5385
@@ -87,8 +87,10 @@ def test_each_kind_is_proved_if_it_is_true_and_only_then(tmp_path, pair):
         assert verdict.says
 
 
-@killed_by("design/verify.py", "((kx, ky), (ky, kx)) if", "((kx, ky), (kx, ky)) if")
-@killed_by("design/proof/exact.py", '(Kx.mT @ data["R"] @ Ky + Ky.mT @ data["R"] @ Kx)', 'he(Kx.mT @ data["R"] @ Ky)')
+@killed_by("robust.design.verify", "((kx, ky), (ky, kx)) if", "((kx, ky), (kx, ky)) if")
+@killed_by(
+    "robust.design.proof.exact", '(Kx.mT @ data["R"] @ Ky + Ky.mT @ data["R"] @ Kx)', 'he(Kx.mT @ data["R"] @ Ky)'
+)
 def test_an_effort_that_is_not_symmetric_is_counted_whole(tmp_path):
     """Half way V' + x'(Q + K'RK)x = 0.049 x^2, though the symmetric part of Ka'R Kb alone would leave it negative."""
     k, p, q = np.array([[[-4.11], [0.0]], [[-2.23], [0.01]]]), np.array([2.0, 1.0]), 1e-6
@@ -172,13 +174,15 @@ FALSE = [
 
 
 @killed_by(
-    "design/verify.py",
+    "robust.design.verify",
     '"Q": ("a weight: no diagonal entry below 0", lambda x: min(row[i] for i, row in enumerate(x)) >= 0)',
     '"Q": ("", lambda x: True)',
 )
-@killed_by("design/verify.py", 'yield f"vertex {i}: what V falls by", is_positive_definite(falls)', "pass")
+@killed_by("robust.design.verify", 'yield f"vertex {i}: what V falls by", is_positive_definite(falls)', "pass")
 @killed_by(
-    "design/verify.py", '("[0, inf)", lambda x: x >= 0),\n    "factor"', '("[0, inf)", lambda x: True),\n    "factor"'
+    "robust.design.verify",
+    '("[0, inf)", lambda x: x >= 0),\n    "factor"',
+    '("[0, inf)", lambda x: True),\n    "factor"',
 )
 @pytest.mark.parametrize(("content", "status", "needed"), FALSE, ids=[readable_id(needed) for *_, needed in FALSE])
 def test_nothing_false_and_no_nonsense_is_proved(tmp_path, content, status, needed):
@@ -239,9 +243,9 @@ LARGE = Certificate(Polytope([-np.eye(64)], [np.ones((64, 1))]), np.zeros((1, 64
 DISTURBED = {"P": np.eye(2), "gamma": 2.5, "Bw": [[[1 / 3], [0.0]]], "C": np.eye(2), "D": [[0.0], [1.0]]}
 
 
-@killed_by("design/verify.py", '("Bw", "C", "D"))', '("C", "D"))', case="l2")
-@killed_by("design/verify.py", "repr(float(value))", 'f"{float(value):.9g}"', case="above 1")
-@killed_by("design/verify.py", "if math.prod(sizes) > MAX_STATED_NUMBERS:", "if False:", case="large")
+@killed_by("robust.design.verify", '("Bw", "C", "D"))', '("C", "D"))', case="l2")
+@killed_by("robust.design.verify", "repr(float(value))", 'f"{float(value):.9g}"', case="above 1")
+@killed_by("robust.design.verify", "if math.prod(sizes) > MAX_STATED_NUMBERS:", "if False:", case="large")
 @pytest.mark.parametrize(
     ("proof", "statement"),
     [

@@ -27,24 +27,14 @@ def loaded(name):
 
 exported, parameters, studies = loaded("exported"), loaded("parameters"), loaded("studies")
 
-INNER = {
-    "cli",
-    "compiler",
-    "config",
-    "core",
-    "explore",
-    "papers",
-    "plot",
-    "report",
-    "runtime",
-    "scenario",
-    "simulate",
-}  # not for import by their names, or figures
+ROOMS = ("parts", "robust", "uncertainty", "output", "tune")  # rings of packages that users import
+INNER = {"output.explore", "output.plot", "output.report"}  # not for import by their names, or figures
 
 
 def packages():
-    named = {path.parent.name for path in (ROOT / "diffabs").glob("*/__init__.py")} - INNER
-    return {"diffabs", *(f"diffabs.{name}" for name in named)}
+    inits = [path for ring in ROOMS for path in (ROOT / "diffabs" / ring).glob("*/__init__.py")]
+    rooms = {f"{path.parents[1].name}.{path.parent.name}" for path in inits} - INNER
+    return {"diffabs", *(f"diffabs.{name}" for name in {"engine.interop", "linear", "tune", *rooms})}
 
 
 def pages():
@@ -63,7 +53,7 @@ def test_every_exported_name_comes_from_where_it_is_defined(package):
     names = exported.exported(package)
     own = {name: getattr(value, "__module__", None) or "" for name, value in vars(module).items()}
     made = {name for name, home in own.items() if not name.startswith("_") and home.startswith(package)}
-    assert made - {"simulate"} <= names.keys()  # the package `diffabs.simulate`, which says that it is no function
+    assert made - {"simulate"} <= names.keys()  # the package `diffabs.engine`, which says that it is no function
     for name, path in names.items():
         home, _, last = path.rpartition(".")
         assert getattr(importlib.import_module(home), last) is getattr(module, name)
@@ -95,7 +85,7 @@ def test_the_reference_shows_unit_and_range_of_every_parameter():
 
 @killed_by("../docs/_build/parameters.py", 'named = {"unit": "Unit of the value", ', "named = {")
 def test_a_part_becomes_a_table():
-    text = parameters.table(inspect.getsource(importlib.import_module("diffabs.controllers").PID))
+    text = parameters.table(inspect.getsource(importlib.import_module("diffabs.parts.controllers").PID))
     assert "| `b` | `1.0` | 1 | [0, inf) | Set-point weight of the proportional part. |" in text.splitlines()
     assert "| `antiwindup` | `NoAntiWindup` |  | Part | Anti-windup strategy of the integral. |" in text.splitlines()
     assert parameters.table("def f():\n    return 1\n") == ""
@@ -103,7 +93,7 @@ def test_a_part_becomes_a_table():
 
 
 def test_a_class_shows_how_it_is_called():
-    pid = importlib.import_module("diffabs.controllers").PID
+    pid = importlib.import_module("diffabs.parts.controllers").PID
     lines = parameters.signature(inspect.getsource(pid)).splitlines()
     assert lines[1:3] == ["PID(", "    *,"]
     assert [line.strip(" ,").partition("=")[0] for line in lines[3:-2]] == [f.name for f in dataclasses.fields(pid)]
@@ -122,9 +112,9 @@ def test_a_line_about_a_parameter_keeps_its_name():
 
 
 def test_a_mark_becomes_the_names():
-    text = exported.on_page_markdown("before\n\n<!-- exported: diffabs.stops -->\n", page=None)
-    assert text.startswith("before\n\n::: diffabs.stops.")
-    assert "::: diffabs.stops.Standstill" in text
+    text = exported.on_page_markdown("before\n\n<!-- exported: diffabs.parts.stops -->\n", page=None)
+    assert text.startswith("before\n\n::: diffabs.parts.stops.")
+    assert "::: diffabs.parts.stops.Standstill" in text
     with pytest.raises(ValueError, match="exports nothing"):
         exported.exported("diffabs.cli")
 
@@ -206,7 +196,7 @@ def test_no_page_shows_latex(site):
 @pytest.mark.slow
 def test_a_part_has_one_table_and_no_signature(site):
     page = (site / "reference" / "controllers" / "index.html").read_text()
-    (pid,) = re.findall(r'<h2 id="diffabs.controllers.PID".*?(?=<h2 )', page, re.DOTALL)
+    (pid,) = re.findall(r'<h2 id="diffabs.parts.controllers.PID".*?(?=<h2 )', page, re.DOTALL)
     assert pid.count("<table>") == 1
     assert "Proportional gain" in pid
     assert "antiwindup" in pid

@@ -14,8 +14,11 @@ from mutants import killed_by
 
 import diffabs
 
-PACKAGES = ("controllers", "design", "identify", "linear", "reach", "reliability", "roads", "scenario", "sweep", "tune")
-PACKAGES = ("diffabs", *(f"diffabs.{name}" for name in PACKAGES))
+PACKAGES = """
+linear parts.controllers parts.roads robust.design robust.reach scenario tune tune.identify uncertainty.reliability
+uncertainty.sweep
+"""
+PACKAGES = ("diffabs", *(f"diffabs.{name}" for name in PACKAGES.split()))
 
 
 def exported():
@@ -63,7 +66,7 @@ def contract_methods():
     return {one.name for node in classes for one in node.body if isinstance(one, ast.FunctionDef)} | set(offered)
 
 
-@killed_by("core/cubic.py", '"""Return dp/dx at', '"""The slope dp/dx at')
+@killed_by("core.cubic", '"""Return dp/dx at', '"""The slope dp/dx at')
 @pytest.mark.parametrize("path", FILES)
 def test_a_docstring_begins_with_a_sentence(path):
     """Of a function with a verb, of a property or a class with a noun."""
@@ -78,7 +81,7 @@ def test_a_docstring_begins_with_a_sentence(path):
             assert text.split()[0] not in NO_VERBS, f"{owner}{node.name}: {text.splitlines()[0]}"
 
 
-@killed_by("roads/optimum.py", "        speed: Vehicle", "        velocity: Vehicle")
+@killed_by("parts.roads.optimum", "        speed: Vehicle", "        velocity: Vehicle")
 @pytest.mark.parametrize("name", [name for name, item in EXPORTED.items() if inspect.isfunction(item)])
 def test_every_argument_of_an_exported_function_is_described(name):
     """Under Args. An internal function describes what its names and types do not say."""
@@ -90,17 +93,26 @@ def test_every_argument_of_an_exported_function_is_described(name):
 
 
 MOST_USED = {
-    *("core.pytree.replace", "simulate.run.rollout", "simulate.run.measure", "simulate.ensemble.run_batch"),
-    *("simulate.solve.solve", "simulate.types.FixedStep", "simulate.types.Adaptive", "controllers.pid.PID"),
+    *("core.pytree.replace", "engine.run.rollout", "engine.run.measure", "loop.ensemble.run_batch"),
+    *("engine.solve.solve", "engine.types.FixedStep", "engine.types.Adaptive", "parts.controllers.pid.PID"),
     *("linear.regulator.lqr", "linear.riccati.care", "linear.stability_margins.margins"),
-    *("design.synthesis.design", "design.analysis.certify", "reach.cover.prove_box"),
+    *("robust.design.synthesis.design", "robust.design.analysis.certify", "robust.reach.cover.prove_box"),
     *("tune.tuning.tune", "tune.tuning.build_problem", "tune.worst.worst_case"),
-    *("identify.identification.identify", "sweep.run.sweep", "reliability.failure.failure_probability"),
+    *(
+        "tune.identify.identification.identify",
+        "uncertainty.sweep.run.sweep",
+        "uncertainty.reliability.failure.failure_probability",
+    ),
 }
 SHOWN = MOST_USED | {
-    *("linear.linearization.linearize", "linear.regulator.dlqr", "design.parameter_box.polytope", "roads.optimum.peak"),
-    *(f"roads.{part}" for part in ("burckhardt.Burckhardt", "magic_formula.MagicFormula", "tabulated.Tabulated")),
-    "roads.patches.Patches",
+    *(
+        "linear.linearization.linearize",
+        "linear.regulator.dlqr",
+        "robust.design.parameter_box.polytope",
+        "parts.roads.optimum.peak",
+    ),
+    *(f"parts.roads.{part}" for part in ("burckhardt.Burckhardt", "magic_formula.MagicFormula", "tabulated.Tabulated")),
+    "parts.roads.patches.Patches",
 }
 EXAMPLES = {
     test.name: test
@@ -114,7 +126,7 @@ def test_what_is_used_most_has_an_example():
     assert {name.removeprefix("diffabs.") for name in EXAMPLES} >= SHOWN
 
 
-@killed_by("linear/regulator.py", "    Notes:\n", "    Remarks:\n", case="linear.regulator.lqr")
+@killed_by("linear.regulator", "    Notes:\n", "    Remarks:\n", case="linear.regulator.lqr")
 @pytest.mark.parametrize("name", sorted(MOST_USED))
 def test_what_is_used_most_is_explained(name):
     """With what is similar, and with formulas and their sources."""
@@ -124,11 +136,19 @@ def test_what_is_used_most_is_explained(name):
 
 
 DEAR = (  # some seconds of compiling
-    *("diffabs.linear.regulator.lqr", "diffabs.linear.riccati.care", "diffabs.reliability.failure.failure_probability"),
-    *("diffabs.simulate.ensemble.run_batch", "diffabs.simulate.run.measure", "diffabs.linear.linearization.linearize"),
-    *("diffabs.roads.optimum.peak", "diffabs.tune.tuning.tune", "diffabs.tune.worst.worst_case"),
-    *("diffabs.sweep.run.sweep", "diffabs.identify.identification.identify", "diffabs.reach.cover.prove_box"),
-    *("diffabs.simulate.solve.solve", "diffabs.simulate.run.rollout"),
+    *(
+        "diffabs.linear.regulator.lqr",
+        "diffabs.linear.riccati.care",
+        "diffabs.uncertainty.reliability.failure.failure_probability",
+    ),
+    *("diffabs.loop.ensemble.run_batch", "diffabs.engine.run.measure", "diffabs.linear.linearization.linearize"),
+    *("diffabs.parts.roads.optimum.peak", "diffabs.tune.tuning.tune", "diffabs.tune.worst.worst_case"),
+    *(
+        "diffabs.uncertainty.sweep.run.sweep",
+        "diffabs.tune.identify.identification.identify",
+        "diffabs.robust.reach.cover.prove_box",
+    ),
+    *("diffabs.engine.solve.solve", "diffabs.engine.run.rollout"),
 )
 
 
@@ -138,7 +158,11 @@ def test_the_example_prints_what_it_says(name):
     assert doctest.DocTestRunner().run(EXAMPLES[name], out=told.append).failed == 0, "".join(told)
 
 
-OURS = "|".join(sorted(path.parent.name for path in HOME.glob("*/__init__.py")))
+WORDS = {"loop", "output", "parts", "uncertainty"}  # rings whose names are words of ours, too
+RINGS = {path.parent.name: path.parent.name for path in HOME.glob("*/__init__.py")}
+ROOMS = {path.parent.name: f"{path.parts[-3]}/{path.parts[-2]}" for path in HOME.glob("*/*/__init__.py")}
+HOMES = {**ROOMS, **RINGS}  # a room may be named without its ring
+OURS = "|".join(sorted(HOMES.keys() - WORDS - {"step", "native", "proof", "runtime", "statistics"}))
 DOTTED = re.compile(rf"`(?:diffabs\.)?((?:{OURS})(?:\.[A-Za-z_]\w*)+)[`(]")
 PLACE = re.compile(rf"`(?:diffabs/)?((?:{OURS})/\w[\w/]*\w)")
 ENDINGS = {"html"}  # endings of files that have a package's name
@@ -146,8 +170,9 @@ ENDINGS = {"html"}  # endings of files that have a package's name
 
 def is_there(dotted):
     """Whether a name of the package leads to a module or to what is in one."""
+    first, *rest = dotted.split(".")
     found = diffabs
-    for name in dotted.split("."):
+    for name in (*HOMES[first].split("/"), *rest):
         try:
             found = getattr(found, name, None) or importlib.import_module(f"{found.__name__}.{name}")
         except ImportError:
@@ -157,13 +182,14 @@ def is_there(dotted):
 
 def is_a_place(place):
     """Whether a module, a package, a test or another file stands there."""
-    homes = (HOME / place, HOME.parent / "tests" / place)
+    first, _, rest = place.partition("/")
+    homes = (HOME / HOMES[first] / rest, HOME.parent / "tests" / place)
     return any(home.is_dir() or any(home.parent.glob(f"{home.name}.*")) for home in homes)
 
 
-@killed_by("tune/constraints.py", "`design.interior.decay_rate`", "`design.sensitivity`")
+@killed_by("tune.constraints", "`design.interior.decay_rate`", "`design.sensitivity`")
 def test_what_is_named_is_there():
-    """In the text of the package and on the pages: dotted names, and places such as `simulate/batch`."""
+    """In the text of the package and on the pages: dotted names, and places such as `loop/batch`."""
     for path in [*HOME.rglob("*.py"), *(HOME.parent / "docs").rglob("*.md")]:
         text = path.read_text(encoding="utf-8")
         names = [name for name in DOTTED.findall(text) if name.rpartition(".")[2] not in ENDINGS]

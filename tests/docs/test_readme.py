@@ -193,7 +193,7 @@ def test_the_promised_message():
 
 def test_the_section_for_tuning_is_one():
     block = re.search(r"^    \[tune\]\n(?:    .*\n)+", COMMANDS, re.MULTILINE)
-    packaged = importlib.resources.files("diffabs") / "scenarios" / "slip-cured.toml"
+    packaged = importlib.resources.files("diffabs.scenario") / "scenarios" / "slip-cured.toml"
     head = packaged.read_text().partition("[tune]")[0]
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "mine.toml"

@@ -14,7 +14,7 @@ from diffabs import FixedStep
 from diffabs.core.pytree import replace
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.papers import record
-from diffabs.plants import QuarterCar
+from diffabs.parts.plants import QuarterCar
 from diffabs.scenario.scenario import load
 
 pytest.importorskip("matplotlib")

@@ -18,7 +18,7 @@ import diffabs as d
 from diffabs import controllers, objectives, references, scenario, sensors
 from diffabs.core.blocks import Series
 from diffabs.core.protocols import BrakeOutput, Clock
-from diffabs.roads import RIG
+from diffabs.parts.roads import RIG
 
 
 @pytest.fixture(scope="module")
@@ -58,9 +58,11 @@ def quiet(rig, speed, case):
 
 
 @pytest.mark.slow
-@killed_by("controllers/sampled_on_grid.py", "waits * m.last + (1 - waits) * m.next", "m.next", case="all wrong-known")
 @killed_by(
-    "sensors/speed.py",
+    "parts.controllers.sampled_on_grid", "waits * m.last + (1 - waits) * m.next", "m.next", case="all wrong-known"
+)
+@killed_by(
+    "parts.sensors.speed",
     "error = self.last + (self.first - self.last) * jnp.exp(-t / self.time_constant)",
     "error = self.last + 0.0 * t",
     case="all wrong-known",
@@ -104,7 +106,7 @@ CONTROLLERS = [pytest.param(path, id=path.stem, marks=() if path.stem in EXAMPLE
 
 
 @killed_by(
-    "controllers/switching.py",
+    "parts.controllers.switching",
     "self.gain * inside, self.low",
     "2 * self.gain * inside, self.low",
     case="estimated-sliding-mode-cma-es",
@@ -194,7 +196,7 @@ def let_go(rig, rest):
     return one, d.rollout(one, d.FixedStep(1e-3, 4.0, kinks=False), key=jax.random.key(0))
 
 
-@killed_by("sensors/speed_estimator.py", "(slip < self.gate) | (braked >= self.rest)", "(slip < 2.0)")
+@killed_by("parts.sensors.speed_estimator", "(slip < self.gate) | (braked >= self.rest)", "(slip < 2.0)")
 @pytest.mark.slow
 def test_a_brake_that_was_let_go_by_mistake_bites_again(rig):
     """The wheel that seems to slip does not push, so it is believed in the end; the same in NumPy. Where nobody looks
@@ -212,7 +214,7 @@ def test_a_brake_that_was_let_go_by_mistake_bites_again(rig):
     np.testing.assert_array_less(5 / 3.6, np.asarray(lost.trajectory.sample.output.speed))
 
 
-@killed_by("controllers/sampled_on_grid.py", "fixed / clock.h, 0.0", "fixed / clock.h + 0.5, 0.0")
+@killed_by("parts.controllers.sampled_on_grid", "fixed / clock.h, 0.0", "fixed / clock.h + 0.5, 0.0")
 @pytest.mark.slow
 def test_the_grid_agrees_with_located_events(rig):
     """Where the computing delay is located by events, and by the mean over the step in which the command changes."""
@@ -256,7 +258,7 @@ def fed(block, outputs, key=None):
 
 
 @killed_by(
-    "sensors/noise.py", "wheel_speed=signal.wheel_speed - signal.speed * noise", "wheel_speed=signal.wheel_speed"
+    "parts.sensors.noise", "wheel_speed=signal.wheel_speed - signal.speed * noise", "wheel_speed=signal.wheel_speed"
 )
 def test_noise_of_the_wheel_is_the_slip_s_at_any_speed():
     n = 4000
@@ -272,7 +274,7 @@ def test_noise_of_the_wheel_is_the_slip_s_at_any_speed():
     assert float(sensors.WheelNoise(slip=0.01).start(true).held[0]) == 0  # before the first instant
 
 
-@killed_by("sensors/noise.py", "played % noise.size", "played")
+@killed_by("parts.sensors.noise", "played % noise.size", "played")
 def test_a_played_noise_is_the_sequence_that_is_given():
     """Three entries of 2 ms, which repeat, of the slip at any speed."""
     n, noise = 20, np.array([0.01, -0.02, 0.005])
@@ -283,7 +285,7 @@ def test_a_played_noise_is_the_sequence_that_is_given():
     np.testing.assert_allclose((v - seen.wheel_speed) / v, seen.slip, rtol=1e-12)
 
 
-@killed_by("sensors/speed_estimator.py", "clamp(1 - slip / self.gate, 0.0, 1.0)", "1.0 + 0.0 * slip")
+@killed_by("parts.sensors.speed_estimator", "clamp(1 - slip / self.gate, 0.0, 1.0)", "1.0 + 0.0 * slip")
 def test_an_estimator_is_not_led_astray_by_a_wheel_that_locks():
     """It rolls for 20 ms, locks for 0.3 s, and rolls again, at 8 m/s^2; the accelerometer is off by 0.1 m/s^2."""
     t = 1e-3 * jnp.arange(500)
@@ -301,7 +303,7 @@ def test_an_estimator_is_not_led_astray_by_a_wheel_that_locks():
 
 
 @killed_by(
-    "sensors/speed_estimator.py",
+    "parts.sensors.speed_estimator",
     "larger(signal.deceleration, m.braked * jnp.exp(-self.period / self.hold))",
     "signal.deceleration",
 )
@@ -321,7 +323,7 @@ def test_a_wheel_that_does_not_push_is_believed_after_a_while():
         np.testing.assert_allclose(seen.speed, 10.0 - 1e-3 * (np.cumsum(a) - a[0]), rtol=1e-12)
 
 
-@killed_by("sensors/speed_estimator.py", "(1 - gain) * variance", "variance")
+@killed_by("parts.sensors.speed_estimator", "(1 - gain) * variance", "variance")
 def test_the_estimator_averages_the_first_samples():
     """P starts at R, so without growth the gains are 1/2, 1/3, ...: of a wheel that rolls, and is never slower than the
     estimate, the estimate is the mean so far."""
@@ -333,7 +335,7 @@ def test_the_estimator_averages_the_first_samples():
 
 
 @killed_by(
-    "references/limited.py",
+    "parts.references.limited",
     "h = self.period * self.reference_speed / jnp.maximum(signal.speed, self.floor)",
     "h = self.period",
 )

@@ -20,19 +20,19 @@ from project import ROOT
 from seams import replace_seam
 
 from diffabs import FixedStep, Loop, measure, replace, rollout
-from diffabs.controllers import PID, Clamping, Sampled
 from diffabs.core.pytree import parameters
 from diffabs.core.units import Units, resolve_unit
 from diffabs.core.validity import check_part
+from diffabs.engine.stability import stable_step
 from diffabs.linear.operating_point import operating_point
 from diffabs.linear.regulator import lqr
-from diffabs.objectives import IAE, ITAE, FinalError, Overshoot, SettlingTime
-from diffabs.plants import QuarterCar
-from diffabs.references import Setpoint
+from diffabs.parts.controllers import PID, Clamping, Sampled
+from diffabs.parts.objectives import IAE, ITAE, FinalError, Overshoot, SettlingTime
+from diffabs.parts.plants import QuarterCar
+from diffabs.parts.references import Setpoint
+from diffabs.parts.stops import NoStop
 from diffabs.scenario import outside, registry
 from diffabs.scenario.scenario import ScenarioError, dump, load, loads
-from diffabs.simulate.stability import stable_step
-from diffabs.stops import NoStop
 
 HERE = ROOT / "examples" / "dc-servo"
 PARTS = ("--parts", "dc_servo")
@@ -82,8 +82,10 @@ def by_hand(motor, gains):
     return a, np.array([0, 0, 1 / ell, 0, 0]), np.array([-(kp + kd * wc), 0, 0, ki, -kd * wc])
 
 
-@killed_by("objectives/tracking.py", "jnp.where(step > 0, highest", "jnp.where(step != 0, highest")
-@killed_by("objectives/tracking.py", 'getattr(output, "highest", math.inf)', 'getattr(output, "highest_signal", 1.0)')
+@killed_by("parts.objectives.tracking", "jnp.where(step > 0, highest", "jnp.where(step != 0, highest")
+@killed_by(
+    "parts.objectives.tracking", 'getattr(output, "highest", math.inf)', 'getattr(output, "highest_signal", 1.0)'
+)
 @pytest.mark.slow
 def test_the_linear_servo_follows_its_closed_form(servo):
     """exp(A t) with the closed loop written by hand, at every instant; and what is measured, from that curve."""
@@ -152,7 +154,7 @@ def test_the_servo_at_its_limits_agrees_with_scipy(servo):
 
 
 @killed_by(
-    "linear/operating_point.py", "contained = plant | (linear.K != 0)", "contained = plant | (linear.K != linear.K)"
+    "linear.operating_point", "contained = plant | (linear.K != 0)", "contained = plant | (linear.K != linear.K)"
 )
 @pytest.mark.slow
 def test_the_linear_model_is_the_one_written_by_hand(servo):
@@ -179,7 +181,7 @@ def operating_point_speed(loop, model):
 
 
 @pytest.mark.slow
-@killed_by("linear/operating_point.py", "if not linear.residue < MAX_REST_RESIDUE:", "if False:")
+@killed_by("linear.operating_point", "if not linear.residue < MAX_REST_RESIDUE:", "if False:")
 def test_what_has_no_linear_model_says_so(servo):
     loop, _ = linear(servo)
     with pytest.raises(ValueError, match="controller Sampled acts at instants"):
@@ -190,7 +192,7 @@ def test_what_has_no_linear_model_says_so(servo):
         operating_point(replace(loop, {"plant.load": 3.0, "plant.voltage_max": 24.0}))
 
 
-@killed_by("core/units.py", "exponent = int(power or 1) * (-1 if slash else 1)", "exponent = int(power or 1)")
+@killed_by("core.units", "exponent = int(power or 1) * (-1 if slash else 1)", "exponent = int(power or 1)")
 def test_units_are_those_of_the_loop(servo):
     loop, _ = linear(servo)
     units = {path: spec.unit for path, spec, _ in parameters(loop)}
@@ -210,7 +212,7 @@ def test_units_are_those_of_the_loop(servo):
     assert resolve_unit("control^2 s/signal", Units("N m/A", "m/s^2")) == "N^2 m s^3/A^2"
 
 
-@killed_by("simulate/stability.py", "for base in (loop, arrived)", "for base in (loop,)")
+@killed_by("engine.stability", "for base in (loop, arrived)", "for base in (loop,)")
 def test_the_step_is_judged_with_an_unsaturated_controller(servo):
     """At the start the PID commands 24 V whatever happens; its own fast mode is only seen on the target."""
     loop, _ = linear(servo, value=1.0)
@@ -222,7 +224,7 @@ def test_the_step_is_judged_with_an_unsaturated_controller(servo):
 
 
 @killed_by(
-    "scenario/registry.py",
+    "scenario.registry",
     'usual_parts, units = getattr(plant, "usual_parts", dict), units_of(plant)',
     "usual_parts, units = braking().plant.usual_parts, units_of(plant)",
 )
@@ -248,7 +250,7 @@ def test_a_scenario_never_imports_code():
     assert "dc-motor" not in registry.family_types("plant")
 
 
-@killed_by("scenario/registry.py", "if name in _packaged_parts(family) or name in parts:", "if name in parts:")
+@killed_by("scenario.registry", "if name in _packaged_parts(family) or name in parts:", "if name in parts:")
 @pytest.mark.parametrize(
     ("module", "text", "line"),
     [
@@ -256,7 +258,7 @@ def test_a_scenario_never_imports_code():
         ("lacking", "import nowhere_to_be_found", "--parts lacking: there is no module nowhere_to_be_found"),
         ("absent", None, "--parts absent: there is no module absent, on the Python path or in the working directory"),
         ("os; import sys", None, "--parts os; import sys is not the name of a Python module"),
-        ("empty", "from diffabs.controllers import PID", "--parts empty: there is no part in this module"),
+        ("empty", "from diffabs.parts.controllers import PID", "--parts empty: there is no part in this module"),
         ("leaving", "import sys\nsys.exit(3)", "leaving.py, line 2: SystemExit: 3"),
         (
             "clashing",
@@ -283,7 +285,7 @@ METHOD = f"""
 import sys
 print("imported")
 {OF_PARTS}
-from diffabs.roads import RationalCurve
+from diffabs.parts.roads import RationalCurve
 
 @pytree
 class Talking(RationalCurve):
@@ -330,7 +332,7 @@ def test_a_part_that_prints_does_not_spoil_the_document(tmp_path, monkeypatch, c
     assert "called" in result.stderr
 
 
-@killed_by("scenario/outside.py", "entry_points(group=ENTRY_POINT_GROUP)", 'entry_points(group="other")')
+@killed_by("scenario.outside", "entry_points(group=ENTRY_POINT_GROUP)", 'entry_points(group="other")')
 def test_an_installed_module_is_known_by_its_entry_point(tmp_path, monkeypatch):
     shutil.copy(HERE / "dc_servo.py", tmp_path / "dc_servo_installed.py")
     folder = tmp_path / "dc_servo_installed-0.1.0.dist-info"
@@ -352,7 +354,7 @@ def test_an_installed_module_is_known_by_its_entry_point(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@killed_by("cli/usage.py", "register_parts(parts or ())", "register_parts(())")
+@killed_by("cli.usage", "register_parts(parts or ())", "register_parts(())")
 def test_simulate_prints_writes_and_draws(tmp_path, monkeypatch):
     from matplotlib.figure import Figure
     from matplotlib.text import Text
@@ -460,7 +462,7 @@ def resting(monkeypatch, tmp_path, request):
     sys.modules.pop("resting", None)
 
 
-@killed_by("scenario/scenario.py", "name not in sections and part}", "name not in sections}")
+@killed_by("scenario.scenario", "name not in sections and part}", "name not in sections}")
 @pytest.mark.parametrize("resting", ["()", "(ServoStart(), ServoStart(angle=0.5))"], indirect=True)
 def test_a_plant_whose_usual_state_is_a_tuple_is_written_and_read(resting, tmp_path):
     run("show", *AT_REST, *resting, "--out", tmp_path / "mine.toml")
@@ -470,7 +472,7 @@ def test_a_plant_whose_usual_state_is_a_tuple_is_written_and_read(resting, tmp_p
     assert dump(read) == (tmp_path / "mine.toml").read_text()
 
 
-@killed_by("scenario/registry.py", "not isinstance(part, tuple):", "False:")
+@killed_by("scenario.registry", "not isinstance(part, tuple):", "False:")
 @pytest.mark.parametrize("resting", ["None", "{}", "3.0", "[ServoStart()]"], indirect=True)
 def test_a_usual_part_that_is_none_is_refused(resting):
     result = run("simulate", *AT_REST, *resting, status=2)

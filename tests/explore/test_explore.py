@@ -21,18 +21,18 @@ from mutants import killed_by
 from seams import replace_seam
 
 from diffabs.cli import console
-from diffabs.config.values import ScenarioError
 from diffabs.core.pytree import get, parameters, replace
-from diffabs.explore import charts, curves, friction, saving, stability, tuning
-from diffabs.explore.knobs import SLIDER_STEPS, is_vehicle
-from diffabs.explore.panels import Curve, Curves, Fan, Panel, Spread
-from diffabs.explore.session import AS_GIVEN, Session, check_edit, load_basis
-from diffabs.explore.work import NewestJobThread
+from diffabs.engine.run import rollout
+from diffabs.host.values import ScenarioError
 from diffabs.linear import margins, open_loop
 from diffabs.linear.stability_margins import closed_loop_poles
 from diffabs.linear.transfer import Transfer
+from diffabs.output.explore import charts, curves, friction, saving, stability, tuning
+from diffabs.output.explore.knobs import SLIDER_STEPS, is_vehicle
+from diffabs.output.explore.panels import Curve, Curves, Fan, Panel, Spread
+from diffabs.output.explore.session import AS_GIVEN, Session, check_edit, load_basis
+from diffabs.output.explore.work import NewestJobThread
 from diffabs.scenario import dump, load, names
-from diffabs.simulate.run import rollout
 
 SHORT = """
 [plant]
@@ -107,7 +107,7 @@ def test_every_packaged_scenario_opens_with_what_one_drags(name):
         assert knob.spec.holds(knob.high)
 
 
-@killed_by("explore/knobs.py", "part = place / SLIDER_STEPS\n", "part = min(1.0, place / SLIDER_STEPS + 1e-3)\n")
+@killed_by("output.explore.knobs", "part = place / SLIDER_STEPS\n", "part = min(1.0, place / SLIDER_STEPS + 1e-3)\n")
 @pytest.mark.parametrize("name", ["slip-cured", "arm-hanging"])
 def test_places_of_a_slider_are_values(name):
     found = Session(name)
@@ -119,9 +119,9 @@ def test_places_of_a_slider_are_values(name):
             assert knob.place_of(knob.value_at(place)) == pytest.approx(place, abs=0.51)
 
 
-@killed_by("explore/knobs.py", "return math.copysign(1.0, shown) * math", "return math", case="SHORT")
+@killed_by("output.explore.knobs", "return math.copysign(1.0, shown) * math", "return math", case="SHORT")
 @killed_by(
-    "explore/knobs.py", "shown = sign * math.exp(sign * on)", "shown = sign * math.exp(abs(on))", case="slip-cured"
+    "output.explore.knobs", "shown = sign * math.exp(sign * on)", "shown = sign * math.exp(abs(on))", case="slip-cured"
 )
 @pytest.mark.parametrize("name", cases(["SHORT", *names()], *{*names()} - {"slip-cured"}))
 def test_every_slider_rises_from_end_to_end(name, file):
@@ -141,7 +141,7 @@ def test_every_slider_rises_from_end_to_end(name, file):
         assert np.all(shown <= knob.high + rounding)
 
 
-@killed_by("explore/knobs.py", ">= LOGARITHMIC_RATIO * min(abs(low), abs(high))", "< 0")
+@killed_by("output.explore.knobs", ">= LOGARITHMIC_RATIO * min(abs(low), abs(high))", "< 0")
 def test_a_slider_over_decades_is_even_in_the_logarithm(session):
     knob = session.knobs["controller.gain.0"]  # from -1e5 to -300
     middle = -np.sqrt(knob.low * knob.high)
@@ -149,12 +149,12 @@ def test_a_slider_over_decades_is_even_in_the_logarithm(session):
 
 
 @killed_by(
-    "explore/knobs.py",
+    "output.explore.knobs",
     "return read_number_in_range(value, self.spec, self.name) / self.scale",
     "return float(value) / self.scale",
     case="plant.mass--3-plant.mass = -3 is outside 0, inf kg",
 )
-@killed_by("explore/session.py", "    if lines := objections(scenario):\n", "    if (lines := []):\n")
+@killed_by("output.explore.session", "    if lines := objections(scenario):\n", "    if (lines := []):\n")
 @pytest.mark.parametrize(
     ("key", "given", "said"),
     [
@@ -188,9 +188,9 @@ def test_a_spread_that_is_none_is_refused(session, given):
 
 
 @killed_by(
-    "explore/session.py", "return lines or list(find_unstable_step(scenario.loop, scenario.solver))", "return lines"
+    "output.explore.session", "return lines or list(find_unstable_step(scenario.loop, scenario.solver))", "return lines"
 )
-@killed_by("explore/knobs.py", 'return "" if unit == "1" else unit', "return unit")
+@killed_by("output.explore.knobs", 'return "" if unit == "1" else unit', "return unit")
 def test_a_step_that_is_not_stable_is_refused(file, monkeypatch):
 
     found = Session(str(file(SHORT)))
@@ -203,7 +203,7 @@ def test_a_step_that_is_not_stable_is_refused(file, monkeypatch):
     assert (found.value("plant.mass"), found.value("initial.slip")) == (5.5, 0)
 
 
-@killed_by("explore/session.py", "new[() if knob.place is None else knob.place] = value", "new[...] = value")
+@killed_by("output.explore.session", "new[() if knob.place is None else knob.place] = value", "new[...] = value")
 def test_what_is_turned_is_in_the_scenario_and_nowhere_else(file):
     one, other = (Session(str(file(SHORT))) for _ in range(2))
     turn(one, "plant.mass", "5.5")
@@ -218,7 +218,7 @@ def test_what_is_turned_is_in_the_scenario_and_nowhere_else(file):
     assert dump(one.scenario()) == dump(other.scenario())
 
 
-@killed_by("explore/session.py", "                self._values[path] = changed[path]", "                pass")
+@killed_by("output.explore.session", "                self._values[path] = changed[path]", "                pass")
 def test_another_road_leaves_what_was_turned(session):
     turn(session, "plant.mass", "5.5")
     turn(session, "plant.road.scale", "0.5")
@@ -232,7 +232,7 @@ def test_another_road_leaves_what_was_turned(session):
     assert "w4" in dataclasses.asdict(session.scenario().loop.plant.road.road)
 
 
-@killed_by("explore/session.py", "if basis.source == self.source else {}", "")
+@killed_by("output.explore.session", "if basis.source == self.source else {}", "")
 def test_edits_during_the_load_of_a_road_are_kept(session, file):
     turn(session, "plant.mass", "5.5")
     snow, other = session.load_part("road", "snow"), load_basis(str(file(SHORT, "other.toml")))
@@ -244,7 +244,7 @@ def test_edits_during_the_load_of_a_road_are_kept(session, file):
     assert (session.value("plant.mass"), session.value("controller.gain.1")) == (5.3, -48)
 
 
-@killed_by("explore/session.py", "if knob.path in self._values), None)", "if False), None)")
+@killed_by("output.explore.session", "if knob.path in self._values), None)", "if False), None)")
 def test_a_new_road_is_checked_with_the_kept_edits(session, monkeypatch):
     turn(session, "plant.mass", "6.1")
     session.switch(session.load_part("road", "snow"))
@@ -264,9 +264,9 @@ def test_a_part_that_does_not_fit_changes_nothing(session):
     assert session.parts["controller"] == AS_GIVEN
 
 
-@killed_by("explore/friction.py", "had or float(road.scale) != 1.0", "True", case="slip-lmi")
+@killed_by("output.explore.friction", "had or float(road.scale) != 1.0", "True", case="slip-lmi")
 @killed_by(
-    "explore/friction.py",
+    "output.explore.friction",
     "sweep=dataclasses.replace(sweep, over=keys(sweep.over), correlation=correlation)",
     "sweep=sweep",
     case="slip-lmi",
@@ -287,7 +287,7 @@ def test_a_friction_factor_comes_and_goes_without_a_trace(name):
 
 
 @pytest.mark.slow
-@killed_by("explore/session.py", "        now = self.scenario()\n", "        now = self._base\n", case="turned0")
+@killed_by("output.explore.session", "        now = self.scenario()\n", "        now = self._base\n", case="turned0")
 @pytest.mark.parametrize(
     "turned",
     [
@@ -306,7 +306,7 @@ def test_the_command_line_reproduces_the_saved_scenario(session, tmp_path, turne
     assert ("scaled" in path.read_text()) == ("plant.road.scale" in turned)
 
 
-@killed_by("explore/saving.py", "if name != pathlib.PurePath(name).name or", "if")
+@killed_by("output.explore.saving", "if name != pathlib.PurePath(name).name or", "if")
 @pytest.mark.parametrize(
     "name",
     ["mine", "../mine.toml", "{outside}/other.toml", ".mine.toml", ".toml", "", "a/b.toml", "a\\b.toml", "a\nb.toml"],
@@ -319,7 +319,7 @@ def test_a_name_that_leads_elsewhere_is_refused(session, tmp_path, name):
     assert left_in(tmp_path) <= {"in", "mine.toml"}  # the scenario itself
 
 
-@killed_by("explore/saving.py", "if replacing and path.is_file():", "if path.is_file():")
+@killed_by("output.explore.saving", "if replacing and path.is_file():", "if path.is_file():")
 def test_a_file_is_only_replaced_when_that_is_said(session, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
@@ -334,10 +334,10 @@ def test_a_file_is_only_replaced_when_that_is_said(session, tmp_path):
 
 
 @pytest.mark.slow
-@killed_by("explore/curves.py", "int(lost.sum()) - refused", "int(lost.sum())")
-@killed_by("explore/curves.py", "here * (1 + sign * part)", "here * (1 + sign * part / 2)")
+@killed_by("output.explore.curves", "int(lost.sum()) - refused", "int(lost.sum())")
+@killed_by("output.explore.curves", "here * (1 + sign * part)", "here * (1 + sign * part / 2)")
 @killed_by(
-    "explore/curves.py",
+    "output.explore.curves",
     "np.nanquantile(values, QUANTILES, axis=0)",
     "np.nanquantile(values, QUANTILES, axis=0, method='lower')",
 )
@@ -367,7 +367,7 @@ def test_a_fan_has_the_quantiles_of_its_runs(session, monkeypatch):
     np.testing.assert_allclose(found.bands[0][:, early], expected, rtol=1e-9, atol=1e-12)
 
 
-@killed_by("explore/curves.py", "KMH * line.values", "line.values")
+@killed_by("output.explore.curves", "KMH * line.values", "line.values")
 @pytest.mark.slow
 def test_a_draft_is_the_run_to_what_can_be_seen(session):
     exact, draft = (curves.run_curves(session.scenario(), by) for by in (None, curves.Adaptive(rtol=1e-3, step=2.5e-3)))
@@ -380,7 +380,7 @@ def test_a_draft_is_the_run_to_what_can_be_seen(session):
 
 
 @killed_by(
-    "linear/stability_margins.py",
+    "linear.stability_margins",
     "return np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0))\n\n\ndef frequency_grid",
     "return np.linalg.eigvals(system.A)\n\n\ndef frequency_grid",
 )
@@ -399,9 +399,7 @@ def test_poles_of_a_closed_loop_are_those_of_its_polynomial():
 
 
 @pytest.mark.slow
-@killed_by(
-    "scenario/section_design.py", 'self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else', ""
-)
+@killed_by("scenario.section_design", 'self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else', "")
 def test_margins_are_those_of_the_library(session):
     chosen = session.scenario()
     found, oracle = (
@@ -417,8 +415,8 @@ def test_margins_are_those_of_the_library(session):
 
 
 @pytest.mark.slow
-@killed_by("explore/stability.py", "if earlier and earlier.of == of:", "if earlier:")
-@killed_by("explore/stability.py", "if earlier and earlier.of == of:", "if False:")
+@killed_by("output.explore.stability", "if earlier and earlier.of == of:", "if earlier:")
+@killed_by("output.explore.stability", "if earlier and earlier.of == of:", "if False:")
 def test_corners_are_looked_at_again_only_where_they_move(session):
     first = stability.linearise_corners(session.scenario())
     turn(session, "plant.mass", "5.5")  # has a range in [design.over]
@@ -437,12 +435,12 @@ def test_corners_are_looked_at_again_only_where_they_move(session):
 
 
 @killed_by(
-    "explore/session.py",
+    "output.explore.session",
     "        self.adopt(self._accepted)\n",
     "        self._values = dict(list(self._values.items())[:-1])\n",
 )
 @killed_by(
-    "explore/session.py",
+    "output.explore.session",
     "self._values, self.edited = {**self._values, knob.path: new}, knob",
     "self._values[knob.path] = new",
 )
@@ -503,8 +501,8 @@ def test_the_objective_is_the_scenarios_with_all_weights_or_one_metric(file):
         tuning.scenario_with_goal(none, ["controller.gain"], tuning.OWN_OBJECTIVE, known)
 
 
-@killed_by("core/bijectors.py", "value - low < high - value", "True")
-@killed_by("core/bijectors.py", "scale = bijection(low, high, value)", "scale = Interval(low, high)")
+@killed_by("core.bijectors", "value - low < high - value", "True")
+@killed_by("core.bijectors", "scale = bijection(low, high, value)", "scale = Interval(low, high)")
 def test_a_tuning_names_the_bounds_at_which_it_ended(file):
     session = Session(str(file(SHORT)))
     now = session.scenario()
@@ -523,7 +521,7 @@ def test_a_tuning_names_the_bounds_at_which_it_ended(file):
     assert sentences(-110.0, -16.0) == ()
 
 
-@killed_by("explore/tuning.py", "if loop.corners.unstable:", "if False:")
+@killed_by("output.explore.tuning", "if loop.corners.unstable:", "if False:")
 def test_unstable_corners_are_named(file):
     """By the poles of the closed loops; a positive gain drives the slip away."""
     now = Session(str(file(SHORT))).scenario()
@@ -539,8 +537,8 @@ def test_nothing_is_said_of_stable_corners(file):
     assert tuning.describe_instability(Session(str(file(SHORT))).scenario()) == ""
 
 
-@killed_by("explore/tuning.py", "{knob.words(high)}", "{knob.text(high)} {knob.spec.unit}")
-@killed_by("explore/tuning.py", "free_range = scenario.tune.free.get(path)", "free_range = None")
+@killed_by("output.explore.tuning", "{knob.words(high)}", "{knob.text(high)} {knob.spec.unit}")
+@killed_by("output.explore.tuning", "free_range = scenario.tune.free.get(path)", "free_range = None")
 def test_a_tuning_stays_between_the_bounds_that_are_typed(file):
     session = Session(str(file(SHORT)))
     now, known = session.scenario(), session.knobs
@@ -562,14 +560,14 @@ def test_a_tuning_stays_between_the_bounds_that_are_typed(file):
             tuning.scenario_with_goal(now, ["controller.gain"], "iae", known, {"controller.gain.1": pair})
 
 
-@killed_by("explore/session.py", "parameters(loop)}", "parameters(loop) if np.ndim(value) < 2}")
-@killed_by("explore/tuning.py", "and np.ndim(value) < 2", "and True")
+@killed_by("output.explore.session", "parameters(loop)}", "parameters(loop) if np.ndim(value) < 2}")
+@killed_by("output.explore.tuning", "and np.ndim(value) < 2", "and True")
 @killed_by(
-    "explore/tuning.py",
+    "output.explore.tuning",
     "    if path in scenario.tune.free and read == defaults:\n        return scenario.tune.free[path]\n",
     "",
 )
-@killed_by("explore/session.py", "if not np.array_equal(", "if np.ndim(value) < 2 and not np.array_equal(")
+@killed_by("output.explore.session", "if not np.array_equal(", "if np.ndim(value) < 2 and not np.array_equal(")
 def test_a_matrix_is_tuned_in_its_own_bounds_only(file):
     session = Session("arm-balance")
     session.switch(session.load_part("controller", "observer-feedback"))
@@ -594,13 +592,13 @@ def test_a_matrix_is_tuned_in_its_own_bounds_only(file):
 
 
 @killed_by(
-    "explore/tuning.py",
+    "output.explore.tuning",
     "if path in scenario.tune.free and read == defaults:",
     "if scenario.tune.free.get(path) and read == defaults:",
 )
-@killed_by("explore/tuning.py", "end if text == knob.text(end) else knob.read(text)", "knob.read(text)")
+@killed_by("output.explore.tuning", "end if text == knob.text(end) else knob.read(text)", "knob.read(text)")
 @killed_by(
-    "explore/tuning.py",
+    "output.explore.tuning",
     "if path in scenario.tune.free else (knob.low, knob.high)",
     "if False else (knob.low, knob.high)",
 )
@@ -624,7 +622,7 @@ def test_a_declared_range_is_that_of_the_command(file):
         assert found.tune.free == {changed: wanted}
 
 
-@killed_by("explore/stability.py", 'name == "delay" and stable', "False")
+@killed_by("output.explore.stability", 'name == "delay" and stable', "False")
 @pytest.mark.parametrize(
     ("name", "value", "stable", "words"),
     [
@@ -655,8 +653,8 @@ def test_speeds_of_a_plant_without_a_wheel_stay_in_si(session):
     assert session.knobs["initial.speed"].spec.unit == "km/h"
 
 
-@killed_by("explore/curves.py", "(KEPT_MULTIPLE * instants))", "instants)")
-@killed_by("explore/curves.py", "np.append(places, count - 1)", "places")
+@killed_by("output.explore.curves", "(KEPT_MULTIPLE * instants))", "instants)")
+@killed_by("output.explore.curves", "np.append(places, count - 1)", "places")
 @pytest.mark.parametrize("draft", cases([False, True], True))
 def test_a_run_that_stops_early_is_drawn_whole(file, draft):
     """A hundredth of the duration has as many instants as a run needs, and its last one is where it stops."""
@@ -683,7 +681,7 @@ def test_a_transient_ends_when_the_signal_has_settled():
     assert charts.change_time_axis(1.23456789) == {"dataZoom": [{"startValue": 0, "endValue": 1.2346}]}
 
 
-@killed_by("explore/charts.py", "third - quarter, high - third", "third - quarter, high - low")
+@killed_by("output.explore.charts", "third - quarter, high - third", "third - quarter, high - low")
 def test_charts_are_plain_json_whatever_a_run_was():
     lines = (Curve("slip", np.array([0.1, np.nan, np.inf])), Curve("target", np.array([0.0, 1e-30, 123456.789])))
     torque = Panel(
@@ -701,10 +699,10 @@ def test_charts_are_plain_json_whatever_a_run_was():
     json.dumps([charts.run_chart(found), change, charts.pole_chart(), charts.change_poles(None)], allow_nan=False)
 
 
-@killed_by("explore/guard.py", "len(host) == 1 and host[0] in self.hosts", "len(host) == 1")
-@killed_by("explore/guard.py", "return here and same_origin and", "return here and")
-@killed_by("explore/guard.py", "_loopback(request.client)", "True")
-@killed_by("explore/guard.py", "if port == HTTP_PORT else", "if False else")
+@killed_by("output.explore.guard", "len(host) == 1 and host[0] in self.hosts", "len(host) == 1")
+@killed_by("output.explore.guard", "return here and same_origin and", "return here and")
+@killed_by("output.explore.guard", "_loopback(request.client)", "True")
+@killed_by("output.explore.guard", "if port == HTTP_PORT else", "if False else")
 @pytest.mark.parametrize(
     ("allowed", "host", "origin", "client"),
     [
@@ -727,24 +725,24 @@ def test_only_the_own_page_on_this_machine_is_answered(allowed, host, origin, cl
     headers = [(name, value.encode()) for name, value in given.items() if value is not None]
     scope = {"type": "http", "headers": headers, "client": (client, 5) if client else None}
     starlette = pytest.importorskip("starlette.requests")
-    from diffabs.explore.guard import Guard
+    from diffabs.output.explore.guard import Guard
 
     port = 80 if origin == "http://127.0.0.1" else 8342
     assert Guard(None, port, TOKEN).is_allowed(starlette.HTTPConnection(scope)) == allowed
 
 
-@killed_by("explore/guard.py", 'allowed and self._same([request.cookies.get(self.cookie, "")])', "allowed")
+@killed_by("output.explore.guard", 'allowed and self._same([request.cookies.get(self.cookie, "")])', "allowed")
 @killed_by(
-    "explore/guard.py",
+    "output.explore.guard",
     'request.cookies.get(self.cookie, "")',
     'request.headers.get("cookie", "").removeprefix(f"{self.cookie}=")',
 )
 @killed_by(
-    "explore/guard.py",
+    "output.explore.guard",
     "len(tokens) == 1 and secrets.compare_digest(tokens[0].encode(), self.token.encode())",
     "len(tokens) == 1",
 )
-@killed_by("explore/guard.py", "Path=/; HttpOnly;", "Path=/;")
+@killed_by("output.explore.guard", "Path=/; HttpOnly;", "Path=/;")
 @pytest.mark.parametrize(
     ("path", "query", "cookie", "status"),
     [
@@ -768,7 +766,7 @@ def test_only_the_own_page_on_this_machine_is_answered(allowed, host, origin, cl
 )
 def test_a_request_needs_the_token_once_and_then_its_cookie(path, query, cookie, status):
     pytest.importorskip("starlette")
-    from diffabs.explore.guard import STRANGER
+    from diffabs.output.explore.guard import STRANGER
 
     sent = asyncio.run(answered("http", path, query, cookie))
     assert sent[0]["status"] == status
@@ -785,7 +783,7 @@ def test_a_request_needs_the_token_once_and_then_its_cookie(path, query, cookie,
 
 async def answered(kind, path, query, cookie):
     """What a guard sends that knows TOKEN, or its application."""
-    from diffabs.explore.guard import Guard
+    from diffabs.output.explore.guard import Guard
 
     sent = []
 
@@ -804,10 +802,10 @@ async def answered(kind, path, query, cookie):
     return sent
 
 
-@killed_by("explore/server.py", "path.touch(mode=0o600,", "path.touch(mode=0o644,")
+@killed_by("output.explore.server", "path.touch(mode=0o600,", "path.touch(mode=0o644,")
 def test_a_browser_is_led_to_the_token_by_a_file_of_its_user(tmp_path):
     pytest.importorskip("nicegui")
-    from diffabs.explore.server import write_redirect_file
+    from diffabs.output.explore.server import write_redirect_file
 
     path = write_redirect_file(f"http://127.0.0.1:8342/?token={TOKEN}", tmp_path)
     assert path.stat().st_mode & 0o077 == 0
@@ -815,7 +813,7 @@ def test_a_browser_is_led_to_the_token_by_a_file_of_its_user(tmp_path):
 
 
 @killed_by(
-    "explore/work.py",
+    "output.explore.work",
     "            self._job = job\n",
     "            self._job = (lambda a, b: lambda: (a(), b()))(self._job, job) if self._job else job\n",
 )
@@ -833,7 +831,7 @@ def test_a_worker_does_the_newest_and_drops_what_waited():
     worker.end()
 
 
-@killed_by("explore/work.py", "contextlib.suppress(Exception)", "contextlib.suppress(OSError)")
+@killed_by("output.explore.work", "contextlib.suppress(Exception)", "contextlib.suppress(OSError)")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_worker_goes_on_after_a_failed_job():
     failing, done = threading.Event(), threading.Event()
@@ -846,11 +844,10 @@ def test_a_worker_goes_on_after_a_failed_job():
 
 
 @pytest.mark.slow
-@killed_by("cli/explore.py", "PORT = 8342\n", "PORT = 8342\nfrom diffabs.tune import Method as Method\n")
+@killed_by("cli.explore", "PORT = 8342\n", "PORT = 8342\nfrom diffabs.tune import Method as Method\n")
 def test_the_framework_is_only_loaded_by_the_command():
-    code = (
-        "import sys, diffabs, diffabs.explore, diffabs.cli.main, diffabs.explore.session as s; s.Session('slip-cured');"
-    )
+    code = "import sys, diffabs.output.explore, diffabs.cli.main, diffabs.output.explore.session as s;"
+    code += " s.Session('slip-cured');"
     code += " print(sorted({'nicegui', 'fastapi', 'uvicorn', 'optax', 'cvxpy', 'matplotlib'} & sys.modules.keys()))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
@@ -863,11 +860,11 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
 
 
 @killed_by(
-    "cli/explore.py", "        if port is None:\n", "        if port is None and error.errno == errno.EADDRINUSE:\n"
+    "cli.explore", "        if port is None:\n", "        if port is None and error.errno == errno.EADDRINUSE:\n"
 )
 def test_a_refused_usual_port_is_replaced(monkeypatch, file):
     pytest.importorskip("nicegui")
-    from diffabs.explore import server
+    from diffabs.output.explore import server
 
     create, ports = socket.create_server, []
 

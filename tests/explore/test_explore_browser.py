@@ -329,7 +329,7 @@ def test_another_page_is_not_answered(explorer):
 
 @needs_extra
 def test_who_does_not_know_the_token_is_not_answered(explorer):
-    from diffabs.explore.guard import STRANGER
+    from diffabs.output.explore.guard import STRANGER
 
     own = f"Host: 127.0.0.1:{explorer.port}"
     for path in ("/", "/?token=guessed", "/_nicegui/"):

@@ -13,19 +13,19 @@ from mutants import killed_by
 from seams import replace_seam
 from test_explore import SHORT
 
-from diffabs.explore import curves, stability, tuning
-from diffabs.explore.panels import Curves, Fan
-from diffabs.explore.session import AS_GIVEN, CERTIFIED, ProofVerdict, Session, Tools
+from diffabs.output.explore import curves, stability, tuning
+from diffabs.output.explore.panels import Curves, Fan
+from diffabs.output.explore.session import AS_GIVEN, CERTIFIED, ProofVerdict, Session, Tools
 from diffabs.tune.result import DescentPoint, TuningProgress
 
 nicegui = pytest.importorskip("nicegui")
 from nicegui.page import page as route  # noqa: E402  # pyright: ignore[reportMissingImports]
 from nicegui.testing import UserInteraction  # noqa: E402  # pyright: ignore[reportMissingImports]
 
-import diffabs.explore.page  # noqa: E402
+import diffabs.output.explore.page  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable")
-EXPLORE = pathlib.Path(diffabs.explore.page.__file__).parent
+EXPLORE = pathlib.Path(diffabs.output.explore.page.__file__).parent
 NAME = 'my metric :title="alert(1)"'
 LIMIT_S = 60.0
 
@@ -58,7 +58,9 @@ class OpenPage:
         self.proved = []
         tools = Tools(lambda now: self.proved.append(now) or ProofVerdict(CERTIFIED, ""), lambda now: None)
         with self.client:
-            self.page = diffabs.explore.page.Page(Session(str(folder / "mine.toml")), tools, folder, "page's test")
+            self.page = diffabs.output.explore.page.Page(
+                Session(str(folder / "mine.toml")), tools, folder, "page's test"
+            )
             self.page.end()
             self.page.drawer, self.page.thinker, self.page.tuner.worker = Jobs(), Jobs(), Jobs()
             self.page.build()
@@ -102,7 +104,7 @@ def visit(tmp_path):
     return run
 
 
-@killed_by("explore/results.py", '.props["data-metric"] = name', '.props(f"data-metric={name}")')
+@killed_by("output.explore.results", '.props["data-metric"] = name', '.props(f"data-metric={name}")')
 def test_a_metric_of_any_name_is_no_script(visit):
     async def user(opened):
         assert opened.find(NAME, "data-metric") is opened.page.results.cells[NAME]
@@ -124,7 +126,7 @@ def test_texts_of_a_scenario_are_no_attributes():
     assert [ast.unparse(text) for text in texts if not isinstance(text, ast.Constant)] == []
 
 
-@killed_by("explore/page.py", "self.thinker.ask(partial(self._think, now, version))", "pass")
+@killed_by("output.explore.page", "self.thinker.ask(partial(self._think, now, version))", "pass")
 def test_results_follow_a_refused_number(visit, monkeypatch):
     async def user(opened):
         page = opened.page
@@ -156,7 +158,7 @@ def test_results_follow_a_refused_number(visit, monkeypatch):
 
 
 @killed_by(
-    "explore/page.py",
+    "output.explore.page",
     "            return False\n        self.redraw()\n",
     "            return False\n        self.begin()\n",
 )
@@ -187,7 +189,7 @@ def test_a_wider_fan_leaves_chart_and_tuning(visit, monkeypatch):
     visit(user)
 
 
-@killed_by("explore/page.py", "version < max(self.oldest_valid, self.drawn)", "version < self.oldest_valid")
+@killed_by("output.explore.page", "version < max(self.oldest_valid, self.drawn)", "version < self.oldest_valid")
 def test_a_final_curve_never_hides_a_newer_draft(visit, monkeypatch):
     async def user(opened):
         page, late = opened.page, []
@@ -217,7 +219,7 @@ def test_a_final_curve_never_hides_a_newer_draft(visit, monkeypatch):
     visit(user)
 
 
-@killed_by("explore/page.py", "            self.oldest_valid = self.version\n", "            pass\n")
+@killed_by("output.explore.page", "            self.oldest_valid = self.version\n", "            pass\n")
 def test_a_late_curve_does_not_return_after_a_reset(visit):
     async def user(opened):
         await opened.draw()
@@ -233,7 +235,7 @@ def test_a_late_curve_does_not_return_after_a_reset(visit):
 
 
 @killed_by(
-    "explore/page.py",
+    "output.explore.page",
     "        if version < self.oldest_valid:\n            return\n        if self.chart is not None:\n",
     "        if self.chart is not None:\n",
 )
@@ -269,7 +271,7 @@ async def settled(opened, condition):
     assert condition()
 
 
-@killed_by("explore/page.py", "        async with self.switching:\n", "        if True:\n")
+@killed_by("output.explore.page", "        async with self.switching:\n", "        if True:\n")
 def test_two_quick_choices_both_hold(visit, monkeypatch):
     async def user(opened):
         load, gate = opened.session.load_part, threading.Event()
@@ -294,7 +296,7 @@ def broken(*given, **more):
 
 
 @killed_by(
-    "explore/page.py",
+    "output.explore.page",
     "            return\n        self.show_refusal(error)\n        if job",
     "            pass\n        self.show_refusal(error)\n        if job",
 )
@@ -322,14 +324,14 @@ def test_an_error_of_an_old_run_is_not_shown(visit, monkeypatch, action):
 
 
 @killed_by(
-    "explore/page.py", "Exception as error:  # a check that fails", "ScenarioError as error:  # a check that fails"
+    "output.explore.page", "Exception as error:  # a check that fails", "ScenarioError as error:  # a check that fails"
 )
 def test_an_error_in_the_check_withdraws_the_number(visit, monkeypatch):
     async def user(opened):
         await opened.draw()
         opened.enter("plant.mass", "6")
         with monkeypatch.context() as patch:
-            patch.setattr(diffabs.explore.page, "check_edit", broken)
+            patch.setattr(diffabs.output.explore.page, "check_edit", broken)
             await opened.draw()
         assert opened.session.value("plant.mass") == 5.3
         assert opened.page.controls.message.text == "TypeError: broken part"
@@ -341,14 +343,14 @@ def test_an_error_in_the_check_withdraws_the_number(visit, monkeypatch):
 
 
 @killed_by(
-    "explore/page.py",
+    "output.explore.page",
     'with self._report_error("run", version):\n                self._send',
     "if True:\n                self._send",
     case="run",
 )
-@killed_by("explore/page.py", "with self._report_error(name, version):", "if True:", case="fan")
-@killed_by("explore/page.py", 'if job == "fan":', "if False:", case="fan")
-@killed_by("explore/page.py", 'self.chart.change(charts.clear_curves("fan"))', "pass", case="fan")
+@killed_by("output.explore.page", "with self._report_error(name, version):", "if True:", case="fan")
+@killed_by("output.explore.page", 'if job == "fan":', "if False:", case="fan")
+@killed_by("output.explore.page", 'self.chart.change(charts.clear_curves("fan"))', "pass", case="fan")
 @pytest.mark.parametrize("failing", ["run", "fan"])
 def test_an_error_stops_no_other_result(visit, monkeypatch, failing):
     async def user(opened):
@@ -374,7 +376,7 @@ def test_an_error_stops_no_other_result(visit, monkeypatch, failing):
     visit(user)
 
 
-@killed_by("explore/page.py", "_verdict(self.tools.judge, self.session)", "self.tools.judge(self.session)")
+@killed_by("output.explore.page", "_verdict(self.tools.judge, self.session)", "self.tools.judge(self.session)")
 def test_an_error_in_a_proof_file_is_on_its_card(visit):
     async def user(opened):
         opened.page.tools = opened.page.tools._replace(judge=broken)
@@ -386,7 +388,7 @@ def test_an_error_in_a_proof_file_is_on_its_card(visit):
     visit(user)
 
 
-@killed_by("explore/controls.py", "for note in self.session.original.notes:", "for note in ():")
+@killed_by("output.explore.controls", "for note in self.session.original.notes:", "for note in ():")
 def test_entries_that_a_part_removes_are_named(visit):
     async def user(opened):
         with opened.client:
@@ -398,7 +400,7 @@ def test_entries_that_a_part_removes_are_named(visit):
     visit(user)
 
 
-@killed_by("explore/controls.py", '(fan.refused, "refused")', '(0, "refused")')
+@killed_by("output.explore.controls", '(fan.refused, "refused")', '(0, "refused")')
 def test_refused_members_of_a_fan_are_counted(visit):
     async def user(opened):
         opened.page.controls.fan(Fan(None, (), 200, 3, 2, "mass ± 90 %"))
@@ -407,8 +409,10 @@ def test_refused_members_of_a_fan_are_counted(visit):
     visit(user)
 
 
-@killed_by("explore/page.py", "Exception as error:  # also an error in", "ScenarioError as error:  # also an error in")
-@killed_by("explore/page.py", '"" if basis else self.controls.fan_note.text', '""')
+@killed_by(
+    "output.explore.page", "Exception as error:  # also an error in", "ScenarioError as error:  # also an error in"
+)
+@killed_by("output.explore.page", '"" if basis else self.controls.fan_note.text', '""')
 def test_a_part_with_a_defect_changes_nothing(visit, monkeypatch):
     async def user(opened):
         page, asked = opened.page, threading.Event()
@@ -426,7 +430,7 @@ def test_a_part_with_a_defect_changes_nothing(visit, monkeypatch):
 
 
 @killed_by(
-    "explore/page.py",
+    "output.explore.page",
     "Exception as error:  # for example, the file",
     "ScenarioError as error:  # for example, the file",
 )
@@ -436,19 +440,19 @@ def test_a_new_tab_shows_every_error(monkeypatch, tmp_path):
 
     async def body():
         nicegui.core.loop = asyncio.get_running_loop()
-        monkeypatch.setattr(diffabs.explore.page, "Session", broken)
+        monkeypatch.setattr(diffabs.output.explore.page, "Session", broken)
         monkeypatch.setattr(nicegui.Client, "connected", connected)
         client = nicegui.Client(route("/"), request=None)
         with client, contextlib.suppress(TypeError):
-            await diffabs.explore.page.show("mine.toml", Tools(broken, broken), tmp_path, "page's test")
+            await diffabs.output.explore.page.show("mine.toml", Tools(broken, broken), tmp_path, "page's test")
         texts = [getattr(one, "text", "") for one in client.elements.values()]
         assert "TypeError: broken part" in texts
 
     asyncio.run(body())
 
 
-@killed_by("explore/tuner.py", "if not self.dialog.value:", "if False:")
-@killed_by("explore/tuner.py", "        self.dialog.close()\n        self.card", "        self.card")
+@killed_by("output.explore.tuner", "if not self.dialog.value:", "if False:")
+@killed_by("output.explore.tuner", "        self.dialog.close()\n        self.card", "        self.card")
 def test_a_tuning_starts_once_and_from_an_open_dialog(visit):
     async def user(opened):
         tuner = opened.page.tuner
@@ -470,12 +474,12 @@ def test_a_tuning_starts_once_and_from_an_open_dialog(visit):
 
 
 @killed_by(
-    "explore/tuner.py", "Exception as error:  # also an unexpected", "ScenarioError as error:  # also an unexpected"
+    "output.explore.tuner", "Exception as error:  # also an unexpected", "ScenarioError as error:  # also an unexpected"
 )
 def test_a_tuning_that_cannot_start_says_why(visit, monkeypatch):
     async def user(opened):
         opened.click("tune")
-        monkeypatch.setattr(diffabs.explore.tuner.tuning, "scenario_with_goal", broken)
+        monkeypatch.setattr(diffabs.output.explore.tuner.tuning, "scenario_with_goal", broken)
         with contextlib.suppress(TypeError):
             opened.click("start")
         assert opened.page.controls.message.text == "TypeError: broken part"
@@ -483,8 +487,8 @@ def test_a_tuning_that_cannot_start_says_why(visit, monkeypatch):
     visit(user)
 
 
-@killed_by("explore/tuner.py", '"NOT tuned" if tuned.unstable else "tuned"', '"tuned"')
-@killed_by("explore/tuner.py", "(tuned.unstable, *tuned.at_bounds)", "(tuned.unstable,)")
+@killed_by("output.explore.tuner", '"NOT tuned" if tuned.unstable else "tuned"', '"tuned"')
+@killed_by("output.explore.tuner", "(tuned.unstable, *tuned.at_bounds)", "(tuned.unstable,)")
 def test_a_result_with_unstable_corners_is_not_called_tuned(visit):
     async def user(opened):
         tuner, now = opened.page.tuner, opened.session.scenario()
@@ -500,10 +504,10 @@ def test_a_result_with_unstable_corners_is_not_called_tuned(visit):
     visit(user)
 
 
-@killed_by("explore/tuner.py", "if task.samples and task.over else grid", "if False else grid")
-@killed_by("explore/tuner.py", "if not math.isfinite(loss):", "if False:")
-@killed_by("explore/tuner.py", "min(1.0, iteration / limit)", "min(1.0, len(self.losses) / limit)")
-@killed_by("explore/tuner.py", "if progress.round else", "if False else")
+@killed_by("output.explore.tuner", "if task.samples and task.over else grid", "if False else grid")
+@killed_by("output.explore.tuner", "if not math.isfinite(loss):", "if False:")
+@killed_by("output.explore.tuner", "min(1.0, iteration / limit)", "min(1.0, len(self.losses) / limit)")
+@killed_by("output.explore.tuner", "if progress.round else", "if False else")
 def test_the_card_counts_runs_rounds_and_iterations(visit):
     async def user(opened):
         tuner = opened.page.tuner
@@ -527,13 +531,13 @@ def test_the_card_counts_runs_rounds_and_iterations(visit):
 
 
 @killed_by(
-    "explore/tuner.py",
+    "output.explore.tuner",
     "            return\n        self.card.set_visibility(False)\n        self.page.show_refusal(error)\n",
     "            pass\n        self.card.set_visibility(False)\n        self.page.show_refusal(error)\n",
     case="True",
 )
 @killed_by(
-    "explore/tuner.py",
+    "output.explore.tuner",
     "except Exception as error:  # the message",
     "except OSError as error:  # the message",
     case="False",
@@ -557,7 +561,7 @@ def test_a_failed_tuning_is_told_to_its_own_scenario(visit, left):
 
 
 @killed_by(
-    "explore/page.py",
+    "output.explore.page",
     "        if version >= self.oldest_valid:\n            self.learned",
     "        if True:\n            self.learned",
 )
@@ -586,7 +590,7 @@ def test_no_corners_of_the_scenario_before(visit, monkeypatch):
     visit(user)
 
 
-@killed_by("explore/page.py", "self.version + 1, {}", "self.version + 1, self.learned")
+@killed_by("output.explore.page", "self.version + 1, {}", "self.version + 1, self.learned")
 def test_a_quick_fan_is_slow_in_another_scenario(visit, monkeypatch):
     async def user(opened):
         page, done = opened.page, []
@@ -607,8 +611,8 @@ def test_a_quick_fan_is_slow_in_another_scenario(visit, monkeypatch):
     visit(user)
 
 
-@killed_by("explore/tuner.py", "        self.dialog.clear()\n", "", case="tune-ask-tuning")
-@killed_by("explore/saver.py", "        self.dialog.clear()\n", "", case="save-saving")
+@killed_by("output.explore.tuner", "        self.dialog.clear()\n", "", case="tune-ask-tuning")
+@killed_by("output.explore.saver", "        self.dialog.clear()\n", "", case="save-saving")
 @pytest.mark.parametrize(("button", "dialog"), [("tune", "ask-tuning"), ("save", "saving")])
 def test_a_page_keeps_one_dialog(visit, button, dialog):
     async def user(opened):
@@ -622,7 +626,7 @@ def test_a_page_keeps_one_dialog(visit, button, dialog):
     visit(user)
 
 
-@killed_by("explore/controls.py", "knob.place_of(value)) > 0.5", "knob.place_of(value)) > 1e-6")
+@killed_by("output.explore.controls", "knob.place_of(value)) > 0.5", "knob.place_of(value)) > 1e-6")
 def test_a_dragged_slider_is_not_pushed_back(visit):
     async def user(opened):
         slider = opened.find("plant.mass", "data-slider")
@@ -637,7 +641,7 @@ def test_a_dragged_slider_is_not_pushed_back(visit):
     visit(user)
 
 
-@killed_by("explore/controls.py", "        if not line:\n", "        if False:\n")
+@killed_by("output.explore.controls", "        if not line:\n", "        if False:\n")
 def test_the_next_edit_clears_refused_fields(visit):
     async def user(opened):
         refused = {"plant.mass": ("data-field", "-1", "5.3"), "fan-mass": ("data-id", "91", "10")}

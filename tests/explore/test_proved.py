@@ -9,10 +9,10 @@ from commands import assert_one_error_line, run
 from mutants import killed_by
 from test_explore import SHORT, turn
 
-from diffabs.config.values import ScenarioError
-from diffabs.explore.proved import ProvedBox, judge_values, load_proved_box
-from diffabs.explore.session import CERTIFIED, NOT_PROVED, Session
-from diffabs.reach.certificate import FORMAT
+from diffabs.host.values import ScenarioError
+from diffabs.output.explore.proved import ProvedBox, judge_values, load_proved_box
+from diffabs.output.explore.session import CERTIFIED, NOT_PROVED, Session
+from diffabs.robust.reach.certificate import FORMAT
 from diffabs.scenario import dump, load
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable")
@@ -46,7 +46,9 @@ def proved(document: dict[str, Any]) -> ProvedBox:
 
 
 @killed_by(
-    "explore/proved.py", "now = friction.without_factor(session.scenario(), session.original)", "now = session.original"
+    "output.explore.proved",
+    "now = friction.without_factor(session.scenario(), session.original)",
+    "now = session.original",
 )
 def test_values_in_the_box_are_covered(session: Session, proved: ProvedBox) -> None:
     assert judge_values(proved, session) == (
@@ -64,8 +66,8 @@ def test_values_in_the_box_are_covered(session: Session, proved: ProvedBox) -> N
     )
 
 
-@killed_by("explore/proved.py", '{knob.words(value)}" if', '{knob.text(value)} {knob.spec.unit}" if')
-@killed_by("explore/proved.py", "to {knob.words(high)}", "to {knob.text(high)} {knob.spec.unit}")
+@killed_by("output.explore.proved", '{knob.words(value)}" if', '{knob.text(value)} {knob.spec.unit}" if')
+@killed_by("output.explore.proved", "to {knob.words(high)}", "to {knob.text(high)} {knob.spec.unit}")
 def test_a_plain_number_is_named_without_a_unit(session: Session, document: dict[str, Any]) -> None:
     box = [*BOX, [0.15, 0.19]]
     over = document["over"] | {"reference.slip": box[-1]}
@@ -74,7 +76,7 @@ def test_a_plain_number_is_named_without_a_unit(session: Session, document: dict
     assert judge_values(proved, session) == (NOT_PROVED, said)
 
 
-@killed_by("explore/proved.py", "if path not in over and not np.array_equal", "if False and not np.array_equal")
+@killed_by("output.explore.proved", "if path not in over and not np.array_equal", "if False and not np.array_equal")
 @pytest.mark.parametrize(
     ("key", "given", "said"),
     [
@@ -91,7 +93,7 @@ def test_another_value_is_not_covered(session: Session, proved: ProvedBox, key: 
     assert judge_values(proved, session).word == CERTIFIED
 
 
-@killed_by("explore/proved.py", " or _compare_durations(now, proved.scenario)", "")
+@killed_by("output.explore.proved", " or _compare_durations(now, proved.scenario)", "")
 def test_another_loop_or_duration_is_not_covered(proved: ProvedBox, file) -> None:
     longer = Session(str(file(SHORT.replace("duration = 1.0", "duration = 2.0"))))
     assert judge_values(proved, longer) == (NOT_PROVED, "p.json is about runs of 1 s, here they last 2 s")

@@ -17,7 +17,11 @@ from mutants import killed_by
 from structured_text import Block
 
 import diffabs as d
-from diffabs.controllers import (
+from diffabs.core.protocols import BalanceOutput, BrakeOutput
+from diffabs.output.export import NotExported, c_source, computer_program, difference_equations, structured_text
+from diffabs.output.export.device import Input
+from diffabs.output.export.plant_c import plant_source
+from diffabs.parts.controllers import (
     PID,
     BackCalculation,
     Cascade,
@@ -33,13 +37,9 @@ from diffabs.controllers import (
     SlidingMode,
     StateFeedback,
 )
-from diffabs.core.protocols import BalanceOutput, BrakeOutput
-from diffabs.export import NotExported, c_source, computer_program, difference_equations, structured_text
-from diffabs.export.device import Input
-from diffabs.export.plant_c import plant_source
-from diffabs.plants import ArmBalance, LabRig, MirroredRig, QuarterCar
-from diffabs.references import FilteredSlip, FixedSlip, PeakLatch
-from diffabs.roads import PiecewiseLinear, Tabulated
+from diffabs.parts.plants import ArmBalance, LabRig, MirroredRig, QuarterCar
+from diffabs.parts.references import FilteredSlip, FixedSlip, PeakLatch
+from diffabs.parts.roads import PiecewiseLinear, Tabulated
 from diffabs.scenario.defaults import balancing, braking
 from diffabs.scenario.scenario import load
 
@@ -153,20 +153,20 @@ def commands_of_c(found, text, name, seen, folder):
 
 @pytest.mark.slow
 @killed_by(
-    "compiler/operations.py",
+    "compiler.operations",
     '"lower({0}, {1})", "{0} < {1} ? {0} : {1}"',
     '"lower({0}, {1})", "{0} > {1} ? {0} : {1}"',
     case="PID, filtered derivative-float64",
 )
 @killed_by(
-    "compiler/emit/c99_words.py",
+    "compiler.emit.c99_words",
     'return f"{args[0]} ? {args[2]} : {args[1]}"',
     'return f"{args[0]} ? {args[1]} : {args[2]}"',
     case="conditional integration-float64",
 )
-@killed_by("export/c99.py", "i < {self.device.moves}", "i < 1", case="filtered target-float64")
+@killed_by("output.export.c99", "i < {self.device.moves}", "i < 1", case="filtered target-float64")
 @killed_by(
-    "export/device.py",
+    "output.export.device",
     "return inner, state.samples + 1, command",
     "return inner, state.samples, command",
     case="observer-float64",
@@ -293,8 +293,8 @@ double exp isnan printf main s p held command reset started i first n0_ x_table
 
 
 @needs_cc
-@killed_by("compiler/emit/c99_words.py", "or C_MACRO.fullmatch(name)", "")
-@killed_by("export/structured_text.py", 'or name.lower().startswith("end_")', "")
+@killed_by("compiler.emit.c99_words", "or C_MACRO.fullmatch(name)", "")
+@killed_by("output.export.structured_text", 'or name.lower().startswith("end_")', "")
 @pytest.mark.parametrize("standard", ["c99", "gnu17"])
 def test_names_that_a_language_has_taken_get_others(standard, tmp_path):
     """Fields of a part, and entries of its memory, whose text could also end a comment."""
@@ -362,7 +362,7 @@ def test_a_compiler_without_nan_is_refused(tmp_path):
 
 @pytest.mark.slow
 @killed_by(
-    "compiler/emit/c99_words.py",
+    "compiler.emit.c99_words",
     'np.format_float_positional(x, trim="0")',
     'np.format_float_positional(x, precision=7, trim="0")',
 )
@@ -384,7 +384,7 @@ def test_a_whole_run_is_what_the_exported_controller_does(name, tmp_path):
     np.testing.assert_allclose(result, np.asarray(run.trajectory.sample.command)[:count], rtol=1e-12, atol=1e-12)
 
 
-@killed_by("export/device.py", "if offers(reference) or moves:", "if False:")
+@killed_by("output.export.device", "if offers(reference) or moves:", "if False:")
 @needs_cc
 def test_the_target_can_come_from_outside(tmp_path):
     loop = rig(PID(kp=60.0, ki=400.0, low=0.0, high=90.0), reference=PeakLatch())
@@ -401,8 +401,8 @@ def test_the_target_can_come_from_outside(tmp_path):
 
 
 @pytest.mark.slow
-@killed_by("export/difference_equations.py", "with jax.enable_x64(True):", "if True:")
-@killed_by("export/difference_equations.py", "jax.tree.map(lambda x: jnp.asarray(x, float), loop)", "loop")
+@killed_by("output.export.difference_equations", "with jax.enable_x64(True):", "if True:")
+@killed_by("output.export.difference_equations", "jax.tree.map(lambda x: jnp.asarray(x, float), loop)", "loop")
 def test_difference_equations_are_the_controllers():
     """In double precision, also where a session and the loop's own numbers have single precision."""
     pid = PID(kp=60.0, ki=400.0, kd=0.25, cutoff=55.0, high=np.inf, low=0.0)
@@ -419,7 +419,7 @@ def test_difference_equations_are_the_controllers():
 
 
 @pytest.mark.slow
-@killed_by("linear/opened_loop.py", "_open(loop, target, plant=False)", "_open(loop, target, plant=True)")
+@killed_by("linear.opened_loop", "_open(loop, target, plant=False)", "_open(loop, target, plant=True)")
 def test_a_kink_of_the_plant_does_not_matter_to_a_controller():
     """The friction has a knot at the target; the equations of the PI are its own."""
     rig_at_knot = {"plant": QuarterCar(road=PiecewiseLinear()), "reference": FixedSlip(slip=0.2)}
@@ -447,7 +447,7 @@ def test_an_operation_without_translation_is_named():
         c_source(computer_program(rig(Sorted())), "unit")
 
 
-@killed_by("export/difference_equations.py", "ENTRY_ROUNDING = 1e-12", "ENTRY_ROUNDING = 0.0")
+@killed_by("output.export.difference_equations", "ENTRY_ROUNDING = 1e-12", "ENTRY_ROUNDING = 0.0")
 @needs_cc
 @pytest.mark.slow
 def test_the_command_writes_a_file_that_compiles(tmp_path):
@@ -471,7 +471,7 @@ def test_the_command_writes_a_file_that_compiles(tmp_path):
     assert float(rows[2][1]) == pytest.approx(-17300.0)
 
 
-@killed_by("export/device.py", "{period / MAX_STEPS_PER_SAMPLE:g} s", "{step:g} s")
+@killed_by("output.export.device", "{period / MAX_STEPS_PER_SAMPLE:g} s", "{step:g} s")
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -543,7 +543,7 @@ def test_inputs_are_what_the_plant_shows():
     assert isinstance(LOOPS["observer"].plant, ArmBalance)
 
 
-@killed_by("export/lowered.py", "flat(full) if flat(full) not in nodes else full", "flat(full)")
+@killed_by("output.export.lowered", "flat(full) if flat(full) not in nodes else full", "flat(full)")
 @needs_cc
 def test_two_memories_of_one_controller_have_two_names(tmp_path):
     """The torque and the phase of the four-phase logic, against the automaton of its module's head in Python."""
@@ -573,7 +573,7 @@ def test_two_memories_of_one_controller_have_two_names(tmp_path):
     np.testing.assert_allclose([block(slip=slip) for slip in slips], wanted, rtol=1e-12)
 
 
-@killed_by("export/device.py", "lines := list(find_problems(part, prefix))", "lines := []", case="delay")
+@killed_by("output.export.device", "lines := list(find_problems(part, prefix))", "lines := []", case="delay")
 @pytest.mark.parametrize(
     ("controller", "said"),
     [
@@ -588,8 +588,8 @@ def test_numbers_that_make_no_code_are_refused(controller, said):
             export(braking(controller=controller))
 
 
-@killed_by("export/plant_c.py", 'check_numbers(loop.plant, "plant.")', "check_numbers(loop)")
-@killed_by("export/plant_c.py", 'check_numbers(loop.initial, "initial.")', "pass")
+@killed_by("output.export.plant_c", 'check_numbers(loop.plant, "plant.")', "check_numbers(loop)")
+@killed_by("output.export.plant_c", 'check_numbers(loop.initial, "initial.")', "pass")
 def test_only_what_an_fmu_contains_can_be_refused():
     loop = braking(plant=MirroredRig(), controller=PID(kp=np.nan))
     assert plant_source(loop).states == 3
@@ -598,8 +598,8 @@ def test_only_what_an_fmu_contains_can_be_refused():
             plant_source(d.replace(loop, {name: -1.0}))
 
 
-@killed_by("export/device.py", "0 < step < np.inf", "0 <= step <= np.inf", case="options1")
-@killed_by("export/device.py", "not in (np.float32, np.float64)", "== np.int32", case="options4")
+@killed_by("output.export.device", "0 < step < np.inf", "0 <= step <= np.inf", case="options1")
+@killed_by("output.export.device", "not in (np.float32, np.float64)", "== np.int32", case="options4")
 @pytest.mark.parametrize(
     "options", [{"step": -1e-4}, {"step": 0.0}, {"step": np.inf}, {"dtype": np.int32}, {"dtype": np.float16}]
 )
@@ -608,7 +608,7 @@ def test_an_option_out_of_range_is_named(options):
         computer_program(LOOPS["state feedback"], **options)
 
 
-@killed_by("export/lowered.py", "if name in nodes:", "if False:")
+@killed_by("output.export.lowered", "if name in nodes:", "if False:")
 def test_numbers_that_would_have_one_name_are_refused():
     """A part of the controller that is called as the loop's reference is."""
 
@@ -624,7 +624,7 @@ def test_numbers_that_would_have_one_name_are_refused():
         c_source(computer_program(rig(Copy())), "unit")
 
 
-@killed_by("export/device.py", "unit_at(self.spec.unit, k, self.value.size)", "unit_at(self.spec.unit, 0, 1)")
+@killed_by("output.export.device", "unit_at(self.spec.unit, k, self.value.size)", "unit_at(self.spec.unit, 0, 1)")
 def test_each_number_of_a_list_has_its_own_unit():
     """The six gains of a two-wheeler are of three angles and of their rates; declared are only two units."""
     found = computer_program(LOOPS["observer"])
@@ -635,7 +635,7 @@ def test_each_number_of_a_list_has_its_own_unit():
 
 
 @killed_by(
-    "export/c99.py",
+    "output.export.c99",
     'yield from self.words.operations(nodes, "  ")\n        if moving:\n            yield from self._moves(moving)\n',
     'if moving:\n            yield from self._moves(moving)\n        yield from self.words.operations(nodes, "  ")\n',
 )
@@ -656,7 +656,7 @@ def test_a_target_that_moves_is_returned_as_it_was(tmp_path):
     np.testing.assert_allclose([*map(float, said.split())], 0.2 - 0.1 * np.exp(-np.arange(3) / 10), rtol=1e-6)
 
 
-@killed_by("export/lowered.py", "if not more:\n                break", "if names:\n                break")
+@killed_by("output.export.lowered", "if not more:\n                break", "if names:\n                break")
 @needs_cc
 def test_memory_behind_memory_is_kept(tmp_path):
     """The command is the double integral of the error: it needs the first integral only a sample later."""
@@ -691,18 +691,20 @@ def commands_of_text(text, seen):
 
 
 @killed_by(
-    "export/structured_text.py",
+    "output.export.structured_text",
     "return f\"SEL({', '.join(args)})\"",
     'return f"SEL({args[0]}, {args[2]}, {args[1]})"',
     case="conditional integration-float64",
 )
 @killed_by(
-    "compiler/operations.py",
+    "compiler.operations",
     '"SEL({0} < {1}, {1}, {0})"',
     '"SEL({0} > {1}, {1}, {0})"',
     case="PID, filtered derivative-float64",
 )
-@killed_by("export/structured_text.py", "self.device.moves - 1", "self.device.moves", case="filtered target-float64")
+@killed_by(
+    "output.export.structured_text", "self.device.moves - 1", "self.device.moves", case="filtered target-float64"
+)
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", LOOPS)
 def test_structured_text_commands_what_the_parts_do(name, dtype):
@@ -720,7 +722,7 @@ def test_structured_text_commands_what_the_parts_do(name, dtype):
     np.testing.assert_allclose(result[early], wanted[early], rtol=tight, atol=tight * np.max(np.abs(wanted)))
 
 
-@killed_by("export/structured_text.py", '.replace("e", "E")', "")
+@killed_by("output.export.structured_text", '.replace("e", "E")', "")
 @pytest.mark.slow
 def test_a_whole_run_is_what_the_function_block_does():
     chosen = load("slip-cured", ["initial.speed_kmh=40"])
@@ -734,7 +736,7 @@ def test_a_whole_run_is_what_the_function_block_does():
     np.testing.assert_allclose(result, np.asarray(run.trajectory.sample.command)[:count], rtol=1e-12, atol=1e-12)
 
 
-@killed_by("export/structured_text.py", "IF reset OR NOT started", "IF NOT started")
+@killed_by("output.export.structured_text", "IF reset OR NOT started", "IF NOT started")
 def test_a_block_begins_anew_when_it_is_told_to():
     block = Block(structured_text(computer_program(LOOPS["PID, filtered derivative"]), "Unit"))
     first = [block(slip=slip) for slip in (0.1, 0.15, 0.3)]
@@ -743,7 +745,7 @@ def test_a_block_begins_anew_when_it_is_told_to():
 
 
 @killed_by(
-    "export/structured_text.py",
+    "output.export.structured_text",
     "yield from self._operations(live_nodes([*stored.values(), *more]), indent)",
     "yield from (*self._moves(indent), *self._operations(live_nodes([*stored.values(), *more]), indent))",
 )
@@ -788,8 +790,8 @@ class Kinds:
         return jnp.where(odd, entry, -entry) + jnp.minimum(shaped, speed) + jnp.arctan2(slip, speed) + slip**1.5
 
 
-@killed_by("export/structured_text.py", "_TRUNC_{after}", "_TO_{after}")
-@killed_by("compiler/operations.py", "{_ST_RINT} - 1.0", "{_ST_RINT} + 1.0")
+@killed_by("output.export.structured_text", "_TRUNC_{after}", "_TO_{after}")
+@killed_by("compiler.operations", "{_ST_RINT} - 1.0", "{_ST_RINT} + 1.0")
 def test_structured_text_knows_every_kind_of_operation():
     loop = rig(Kinds())
     seen = measured(loop, seed=3)
@@ -798,9 +800,9 @@ def test_structured_text_knows_every_kind_of_operation():
     np.testing.assert_allclose(result, wanted, rtol=1e-12, atol=1e-13)
 
 
-@killed_by("compiler/operations.py", 'range(11, 0, -2), "13.0"', 'range(9, 0, -2), "11.0"', case="tanh-float64")
-@killed_by("compiler/operations.py", "range(12, 0, -2)", "range(10, 0, -2)", case="sinh-float64")
-@killed_by("compiler/operations.py", "< 80.0", "< 800.0", case="cosh-float64")
+@killed_by("compiler.operations", 'range(11, 0, -2), "13.0"', 'range(9, 0, -2), "11.0"', case="tanh-float64")
+@killed_by("compiler.operations", "range(12, 0, -2)", "range(10, 0, -2)", case="sinh-float64")
+@killed_by("compiler.operations", "< 80.0", "< 800.0", case="cosh-float64")
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("name", ["tanh", "sinh", "cosh"])
 def test_hyperbolic_functions_are_right_near_zero_and_up_to_their_overflow(name, dtype):
@@ -821,12 +823,10 @@ def test_hyperbolic_functions_are_right_near_zero_and_up_to_their_overflow(name,
     np.testing.assert_allclose([float(block(slip=x)) for x in slips], wanted, rtol=4 * np.finfo(dtype).eps)
 
 
+@killed_by("compiler.emit.c99_words", 'used_names |= {new, f"{new}_table"}', "used_names.add(new)", case="table first")
+@killed_by("compiler.emit.c99_words", 'used_names & {new, f"{new}_table"}', "new in used_names", case="table last")
 @killed_by(
-    "compiler/emit/c99_words.py", 'used_names |= {new, f"{new}_table"}', "used_names.add(new)", case="table first"
-)
-@killed_by("compiler/emit/c99_words.py", 'used_names & {new, f"{new}_table"}', "new in used_names", case="table last")
-@killed_by(
-    "export/structured_text.py", "used_names & (both", "fresh.lower() in used_names or not (both", case="table last"
+    "output.export.structured_text", "used_names & (both", "fresh.lower() in used_names or not (both", case="table last"
 )
 @pytest.mark.parametrize("order", ["table first", "table last"])
 @needs_cc
@@ -859,14 +859,14 @@ def test_no_variable_has_the_name_of_a_table(order, tmp_path):
     assert float(said) == pytest.approx(wanted, rel=1e-14)
 
 
-@killed_by("export/structured_text.py", "or _is_reserved(name) or name.lower() in OWN:", "or False:", case="step")
+@killed_by("output.export.structured_text", "or _is_reserved(name) or name.lower() in OWN:", "or False:", case="step")
 @pytest.mark.parametrize("name", ["2fast", "a b", "a__b", "Function_Block", "step", "Held"])
 def test_a_name_that_structured_text_does_not_have_is_refused(name):
     with pytest.raises(NotExported, match="no name that Structured Text has"):
         structured_text(computer_program(LOOPS["state feedback"]), name)
 
 
-@killed_by("export/structured_text.py", "OWN | {name.lower()}", "set(OWN)")
+@killed_by("output.export.structured_text", "OWN | {name.lower()}", "set(OWN)")
 def test_no_variable_of_a_block_has_its_name():
     """Identifiers of this language ignore case, and a block's name is one of them."""
     loop, wanted, _ = limited()

@@ -19,12 +19,12 @@ from structured_text import Block
 
 import diffabs as d
 from diffabs.compiler.runtime.toolchain import COMPILER
-from diffabs.controllers import PID, ConstantInput, ConstantTorque, Sampled
 from diffabs.core.types import Vector
-from diffabs.export import NotExported, build_fmu, computer_program, structured_text
-from diffabs.export.plant_c import plant_source
-from diffabs.plants import MirroredRig
-from diffabs.references import FixedSlip
+from diffabs.output.export import NotExported, build_fmu, computer_program, structured_text
+from diffabs.output.export.plant_c import plant_source
+from diffabs.parts.controllers import PID, ConstantInput, ConstantTorque, Sampled
+from diffabs.parts.plants import MirroredRig
+from diffabs.parts.references import FixedSlip
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import load
 
@@ -63,9 +63,9 @@ PLANTS = {
 }
 
 
-@killed_by("export/plant_c.py", "plant.project(rk4_step(", "(lambda x: x)(rk4_step(", case="a wheel that locks")
+@killed_by("output.export.plant_c", "plant.project(rk4_step(", "(lambda x: x)(rk4_step(", case="a wheel that locks")
 @killed_by(
-    "export/plant_c.py",
+    "output.export.plant_c",
     'm->{array}[{k}] = {name};"',
     'm->{array}[{k}] = {names[(k + 1) % len(names)]};"',
     case="balance",
@@ -109,11 +109,11 @@ def test_a_loop_closed_outside_is_the_loop(tmp_path):
 
 @pytest.mark.slow
 @killed_by(
-    "export/plant_c.py",
+    "output.export.plant_c",
     'm->v[{self.places[path]}]" if where',
     'begun[{self.places[path]}]" if where == "v" and path != CONTROL else f"m->v[{self.places[path]}]" if where',
 )
-@killed_by("export/fmi2.c", "(m->phase == RUNNING && at[i] != OUTPUTS)", "0")
+@killed_by("output/export/fmi2.c", "(m->phase == RUNNING && at[i] != OUTPUTS)", "0")
 def test_parameters_are_the_importers(tmp_path):
     changed = d.core.pytree.replace(PLANTS["mirrored rig"], {"plant.mass": 6.2, "initial.slip": 0.1})
     one = imported(PLANTS["mirrored rig"], tmp_path)
@@ -128,7 +128,7 @@ def test_parameters_are_the_importers(tmp_path):
     assert one.set("slip", 0.3) == 3  # an output
 
 
-@killed_by("export/fmi2.c", "{ return copied(c, state); }", "{ return copied(c, c); }")
+@killed_by("output/export/fmi2.c", "{ return copied(c, state); }", "{ return copied(c, c); }")
 def test_a_state_can_be_kept_and_taken_again(tmp_path):
     one = imported(PLANTS["mirrored rig"], tmp_path).begin()
     followed(one, 20, lambda k: 2.0, ("slip",))
@@ -139,7 +139,7 @@ def test_a_state_can_be_kept_and_taken_again(tmp_path):
 
 
 @pytest.mark.slow
-@killed_by("export/fmi2.c", ": ceil(whole);", ": 1.0;")
+@killed_by("output/export/fmi2.c", ": ceil(whole);", ": 1.0;")
 def test_steps_of_any_length_are_taken_by_whole_ones(tmp_path):
     """A step of the importer that is no multiple is divided into equal ones, none longer than that of the plant."""
     one = imported(PLANTS["mirrored rig"], tmp_path).begin()
@@ -152,14 +152,14 @@ def test_steps_of_any_length_are_taken_by_whole_ones(tmp_path):
     assert one.step(1.0, math.nan) == 3
 
 
-@killed_by("export/fmi2.c", "|| strcmp(guid, GUID) != 0", "")
+@killed_by("output/export/fmi2.c", "|| strcmp(guid, GUID) != 0", "")
 def test_who_asks_for_another_is_given_none(tmp_path):
     path = tmp_path / "plant.fmu"
     path.write_bytes(build_fmu(PLANTS["mirrored rig"], "plant", step=STEP))
     assert Fmu(path, tmp_path / "a", guid="{no}").instance.value is None
 
 
-@killed_by("export/plant_c.py", "unit_at(spec.unit, k, numbers.size)", "unit_at(spec.unit, 0, numbers.size)")
+@killed_by("output.export.plant_c", "unit_at(spec.unit, k, numbers.size)", "unit_at(spec.unit, 0, numbers.size)")
 def test_a_number_of_a_list_has_its_own_unit():
     """Each of two units is for a half of the list."""
 
@@ -171,8 +171,8 @@ def test_a_number_of_a_list_has_its_own_unit():
     assert [found[f"plant.loads.{k}"] for k in range(4)] == ["kg", "kg", "m", "m"]
 
 
-@killed_by("export/plant_c.py", 'f"n{k}_"', 'f"n{k}"')
-@killed_by("export/mockup.py", "static const double STEP = {step!r};", "#define STEP {step!r}")
+@killed_by("output.export.plant_c", 'f"n{k}_"', 'f"n{k}"')
+@killed_by("output.export.mockup", "static const double STEP = {step!r};", "#define STEP {step!r}")
 def test_a_plant_may_use_the_names_of_the_glue():
     """Names that the C around the plant's code has: of a result, of two constants and of a type."""
 
@@ -190,9 +190,9 @@ def test_a_plant_may_use_the_names_of_the_glue():
     assert build_fmu(braking(plant=Named()), "plant", step=STEP)
 
 
-@killed_by("export/mockup.py", "enumerate(plant.variables, 1)", "enumerate(plant.variables)")
-@killed_by("export/mockup.py", '{"unit": make_printable(variable.unit)}', "{}")
-@killed_by("export/mockup.py", "zipfile.ZipInfo(path, LONG_AGO)", "path")
+@killed_by("output.export.mockup", "enumerate(plant.variables, 1)", "enumerate(plant.variables)")
+@killed_by("output.export.mockup", '{"unit": make_printable(variable.unit)}', "{}")
+@killed_by("output.export.mockup", "zipfile.ZipInfo(path, LONG_AGO)", "path")
 def test_the_description_says_what_is_what(tmp_path):
     one = imported(PLANTS["mirrored rig"], tmp_path)
     assert one.description.get("fmiVersion") == "2.0"
@@ -274,8 +274,8 @@ def test_calls_out_of_order_are_errors(calls, refused, strict):
     assert one.call(*CALLS[last]) == (3 if refused else 0)
 
 
-@killed_by("export/fmi2.c", "if (isfinite(m->stop) && from + length", "if (0 && from + length")
-@killed_by("export/fmi2.c", "m->stop + 1e-9 * (fabs(m->stop) + length)", "m->stop")
+@killed_by("output/export/fmi2.c", "if (isfinite(m->stop) && from + length", "if (0 && from + length")
+@killed_by("output/export/fmi2.c", "m->stop + 1e-9 * (fabs(m->stop) + length)", "m->stop")
 def test_no_step_passes_the_stop_time(strict):
     """FMI 2.0, 2.1.6: an error. Times that an importer adds up differ from the stop time by rounding."""
     one = strict()
@@ -368,7 +368,7 @@ def test_a_description_is_xml_whatever_the_title(about, tmp_path):
     assert one.description.get("description").isprintable()
 
 
-@killed_by("export/mockup.py", "step, duration = float(step), float(duration)", "pass")
+@killed_by("output.export.mockup", "step, duration = float(step), float(duration)", "pass")
 def test_numbers_of_numpy_are_numbers():
     """A step as from a list of steps gives the same FMU as one of Python, to the byte."""
     rig = PLANTS["mirrored rig"]
@@ -376,8 +376,8 @@ def test_numbers_of_numpy_are_numbers():
     assert found == build_fmu(rig, "plant", step=STEP, duration=2.0)
 
 
-@killed_by("export/mockup.py", "0 < x < math.inf for x in", "0 <= x < math.inf for x in", case="0.0-1.0")
-@killed_by("export/mockup.py", "0 < x < math.inf for x in", "0 < x for x in", case="0.0001-inf")
+@killed_by("output.export.mockup", "0 < x < math.inf for x in", "0 <= x < math.inf for x in", case="0.0-1.0")
+@killed_by("output.export.mockup", "0 < x < math.inf for x in", "0 < x for x in", case="0.0001-inf")
 @pytest.mark.parametrize(
     ("step", "duration"), [(0.0, 1.0), (-STEP, 1.0), (math.inf, 1.0), (math.nan, 1.0), (STEP, 0.0), (STEP, math.inf)]
 )

@@ -15,14 +15,14 @@ from diffabs import controllers, objectives, plants, references, roads, stops
 from diffabs.core.pytree import param, pytree, replace
 from diffabs.core.reason import Reason
 from diffabs.core.types import Scalar
-from diffabs.identify.data import Comparison
-from diffabs.identify.fit import Tolerances, fit
-from diffabs.identify.identification import identify
-from diffabs.identify.residuals import gaussian
-from diffabs.identify.table import Table
-from diffabs.identify.traces import Traces, _keep_instants
+from diffabs.engine.stability import stable_step
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.stability import stable_step
+from diffabs.tune.identify.data import Comparison
+from diffabs.tune.identify.fit import Tolerances, fit
+from diffabs.tune.identify.identification import identify
+from diffabs.tune.identify.residuals import gaussian
+from diffabs.tune.identify.table import Table
+from diffabs.tune.identify.traces import Traces, _keep_instants
 
 X = np.linspace(0.0, 3.0, 13)
 NOISE = np.random.default_rng(3).standard_normal(13)
@@ -86,7 +86,7 @@ class TestFit:
         assert told[-1][0] >= after
 
     @killed_by(
-        "identify/uncertainty.py",
+        "tune.identify.uncertainty",
         "jacobian = (data * size / scale)[:, free]",
         "jacobian = (data * size)[:, free]",
         case="False",
@@ -105,7 +105,7 @@ class TestFit:
         np.testing.assert_allclose(np.diag(found.uncertainty.correlation), 1.0, rtol=1e-12, atol=0)
 
     @killed_by(
-        "identify/fit.py",
+        "tune.identify.fit",
         "over = np.divide(1.0, slope, out=np.zeros_like(slope), where=slope != 0)",
         "over = np.ones_like(slope)",
     )
@@ -125,7 +125,7 @@ class TestFit:
         assert found.start == {"a": 1.0, "k": 0.5, "c": pytest.approx(0.1)}
 
     @killed_by(
-        "identify/uncertainty.py",
+        "tune.identify.uncertainty",
         "np.concatenate([jacobian, (prior * size)[:, free]])",
         "np.concatenate([jacobian, (0 * prior)[:, free]])",
     )
@@ -163,7 +163,7 @@ class TestFit:
         assert found.uncertainty.correlation[0, 1] == pytest.approx(-1.0, abs=1e-6)
         assert found.uncertainty.singular[-1] < 1e-9 * found.uncertainty.singular[0]
 
-    @killed_by("identify/fit.py", "if far > END_COORDINATE and", "if False and")
+    @killed_by("tune.identify.fit", "if far > END_COORDINATE and", "if False and")
     @pytest.mark.parametrize(("low", "high"), [(0.5, 1.0), (0.5, 50.0), (0.5, np.inf)])
     def test_a_value_at_an_end_of_its_range_has_no_deviation(self, low, high):
         """The best slope is about 0.4, below the range: c stays at 0.5, and a is the mean of the rest of the line."""
@@ -179,7 +179,7 @@ class TestFit:
         assert "c          0.8     0.5         end of range" in str(found)
         assert "c is at the end 0.5 of its range, so it has no standard deviation" in str(found)
 
-    @killed_by("identify/fit.py", "abs(value - end) * slope < MAX_END_DISTANCE", "True")
+    @killed_by("tune.identify.fit", "abs(value - end) * slope < MAX_END_DISTANCE", "True")
     def test_far_from_a_start_is_not_at_an_end(self):
         """0.4 is 4e-6 of the start's distance from the end 0, but many standard deviations away from it."""
         best, found = (fit(Line(c=c), {"c": (0.0, np.inf)}, line_residuals, data=LINE, sigma=SIGMA) for c in (0.5, 1e5))
@@ -187,7 +187,7 @@ class TestFit:
         np.testing.assert_allclose(found.values["c"], best.values["c"], rtol=1e-6)
         np.testing.assert_allclose(found.uncertainty.deviations["c"], best.uncertainty.deviations["c"], rtol=1e-6)
 
-    @killed_by("identify/fit.py", "slope * size > 1 and ", "", case="beside an end")
+    @killed_by("tune.identify.fit", "slope * size > 1 and ", "", case="beside an end")
     @pytest.mark.parametrize("low", [0.1, 0.4999], ids=["far from an end", "beside an end"])
     def test_a_value_without_influence_is_undetermined_and_not_at_an_end(self, low):
         found = fit(Decay(), {"a": None, "k": (low, 10.0)}, line_residuals, data=LINE, sigma=SIGMA)
@@ -214,7 +214,7 @@ class TestFit:
         assert str(found).count("x.") == 3  # two rows and a note
         np.testing.assert_allclose(found.uncertainty.deviations["x.0"], 1.0, rtol=1e-9)
 
-    @killed_by("identify/fit.py", "in self.uncertainty.undetermined_parameters()", "in ()")
+    @killed_by("tune.identify.fit", "in self.uncertainty.undetermined_parameters()", "in ()")
     def test_the_table_says_what_is_undetermined(self):
         def product(part, x, y):
             return part.a * part.k * jnp.exp(-x) + part.c - y
@@ -250,7 +250,7 @@ class TestFit:
         )
         assert 1.5 < found.values["a"] <= 3.0
 
-    @killed_by("identify/residuals.py", "return evaluation if evaluation.finite() else None", "return evaluation")
+    @killed_by("tune.identify.residuals", "return evaluation if evaluation.finite() else None", "return evaluation")
     def test_the_best_start_wins_and_the_others_are_kept(self):
         def well(part):
             return jnp.where(part.a > 10, jnp.nan, (part.a**2 - 4) * (part.a + 3))[None]
@@ -285,8 +285,8 @@ class TestFit:
             )
         assert len(calls) <= 3  # traced once, and once per fit for its shape
 
-    @killed_by("identify/fit.py", "if k and estimated:", "if k and sigma is None:")
-    @killed_by("identify/fit.py", "    check_prior(prior, [entry.path for entry in where.entries])\n", "")
+    @killed_by("tune.identify.fit", "if k and estimated:", "if k and sigma is None:")
+    @killed_by("tune.identify.fit", "    check_prior(prior, [entry.path for entry in where.entries])\n", "")
     @pytest.mark.parametrize(
         ("changed", "message"),
         [
@@ -320,7 +320,7 @@ class TestFit:
         with pytest.raises(ValueError, match=message):
             fit(Decay(), residuals=decay_residuals, **arguments)
 
-    @killed_by("identify/residuals.py", "if not np.isfinite(np.asarray(mean, float)).all()", "if False")
+    @killed_by("tune.identify.residuals", "if not np.isfinite(np.asarray(mean, float)).all()", "if False")
     @pytest.mark.parametrize(
         ("known", "message"),
         [
@@ -334,7 +334,7 @@ class TestFit:
         with pytest.raises(ValueError, match=message):
             gaussian({"a": known})
 
-    @killed_by("identify/residuals.py", "if not distributions:", "if False:")
+    @killed_by("tune.identify.residuals", "if not distributions:", "if False:")
     def test_a_prior_without_parameters_is_an_error(self):
         with pytest.raises(ValueError, match="the prior has no parameter; leave the prior out"):
             gaussian({})
@@ -390,7 +390,7 @@ class TestTraces:
         np.testing.assert_allclose(np.std(left["wheel_speed"]), 0.05, rtol=0.15, atol=0)
 
     @killed_by(
-        "identify/traces.py", "part = clamp(ratio(t - times[i], times[i + 1] - times[i]), 0.0, 1.0)", "part = 0.0 * t"
+        "tune.identify.traces", "part = clamp(ratio(t - times[i], times[i + 1] - times[i]), 0.0, 1.0)", "part = 0.0 * t"
     )
     @pytest.mark.slow
     def test_the_output_is_interpolated_and_constant_after_the_end(self):
@@ -424,7 +424,7 @@ class TestTraces:
         assert scale * peak < 0
         assert abs(inertia) < 1e-6
 
-    @killed_by("identify/traces.py", '        check_sigma_table(self.sigma, "columns")\n', "")
+    @killed_by("tune.identify.traces", '        check_sigma_table(self.sigma, "columns")\n', "")
     @pytest.mark.parametrize(
         ("changed", "message"),
         [
@@ -449,7 +449,7 @@ class TestTraces:
         with pytest.raises(ValueError, match=message):
             identify(LOOP, data, FREE, solver=SOLVER)
 
-    @killed_by("identify/identification.py", "rounding=decimal.ROUND_FLOOR", "rounding=decimal.ROUND_CEILING")
+    @killed_by("tune.identify.identification", "rounding=decimal.ROUND_FLOOR", "rounding=decimal.ROUND_CEILING")
     @pytest.mark.slow
     def test_a_step_that_is_not_stable_is_named(self):
         data = Traces(t=T, columns={"speed": T})
@@ -463,7 +463,7 @@ class TestTraces:
         longest, found = float(stable_step(loop)), float(str(caught.value).split()[-2])
         assert longest - 10.0 ** np.floor(np.log10(longest) - 2) < found <= longest
 
-    @killed_by("identify/identification.py", 'if why.endswith("is not stable"):', "if True:")
+    @killed_by("tune.identify.identification", 'if why.endswith("is not stable"):', "if True:")
     def test_another_refusal_does_not_blame_the_step(self):
         """The step is not stable either, but a shorter one would not help."""
         stiff = dataclasses.replace(LOOP, controller=controllers.PID(kp=3893.0, low=0.0, high=90.0))
@@ -484,7 +484,7 @@ class Distances:
         return Comparison(residuals, (np.array([1.0, 2.0]),), np.ones(2), lambda part: [])
 
 
-@killed_by("identify/identification.py", "    starts = tuple(starts)\n", "")
+@killed_by("tune.identify.identification", "    starts = tuple(starts)\n", "")
 def test_starts_may_come_from_a_generator():
     starts = ({"plant.inertia": x} for x in (0.5, 3.0))
     found = identify(LOOP, Distances(), ["plant.inertia"], solver=SOLVER, starts=starts)
@@ -522,7 +522,7 @@ class TestTable:
             np.testing.assert_allclose(ours, run.metrics[metric] - values[row][metric], rtol=0, atol=1e-10)
         np.testing.assert_array_equal(against.sigma, [0.01, 0.1, 0.01, 0.01])
 
-    @killed_by("identify/data.py", 'if not hasattr(sigma, "keys"):', "if not isinstance(sigma, dict):")
+    @killed_by("tune.identify.data", 'if not hasattr(sigma, "keys"):', "if not isinstance(sigma, dict):")
     def test_sigma_may_be_a_series(self):
         table = Table(
             loops=ROWS,
@@ -533,7 +533,7 @@ class TestTable:
         traces = Traces(t=T, columns={"speed": T}, sigma=pd.Series({"speed": 0.2}))
         np.testing.assert_array_equal(traces.against(LOOP, ["plant.inertia"], SOLVER).sigma, np.full(T.size, 0.2))
 
-    @killed_by("identify/table.py", '        check_sigma_table(self.sigma, "metrics")\n', "")
+    @killed_by("tune.identify.table", '        check_sigma_table(self.sigma, "metrics")\n', "")
     @pytest.mark.parametrize(
         ("changed", "message"),
         [
@@ -568,7 +568,7 @@ def test_the_derivative_through_interpolation_is_right():
     np.testing.assert_allclose(slope, (seen(0.9 + h) - seen(0.9 - h)) / (2 * h), rtol=1e-6, atol=1e-8)
 
 
-@killed_by("identify/traces.py", "math.gcd(*whole.astype(int).tolist()) or 1", "solver.every")
+@killed_by("tune.identify.traces", "math.gcd(*whole.astype(int).tolist()) or 1", "solver.every")
 def test_a_run_keeps_the_instants_of_its_data():
     """Of a sparse record no straight line is left: the steps stay, or the grid of adaptive steps is divided."""
     t = 5 + 37.3 * np.arange(16)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from mutants import killed_by
 
-from diffabs.identify.noise import match_times
-from diffabs.simulate.types import FixedStep
+from diffabs.engine.types import FixedStep
+from diffabs.tune.identify.noise import match_times
 
 
 def test_a_trajectory_is_as_long_as_the_data() -> None:
@@ -17,8 +17,8 @@ def test_a_trajectory_is_as_long_as_the_data() -> None:
     assert match_times(FixedStep(0.1, 0.3), t)[0].duration == pytest.approx(0.3)
 
 
-@killed_by("identify/noise.py", "end * (1 + FILE_ROUNDING)", "end", case="product")
-@killed_by("identify/noise.py", "np.minimum(t, end)", "t")
+@killed_by("tune.identify.noise", "end * (1 + FILE_ROUNDING)", "end", case="product")
+@killed_by("tune.identify.noise", "np.minimum(t, end)", "t")
 @pytest.mark.parametrize(
     ("step", "duration"), [(3e-4, 3.0), (2 / 3, 2 / 3), (5 / 3, 5 / 3)], ids=["product", "thirds", "five thirds"]
 )

@@ -14,8 +14,19 @@ from mutants import killed_by
 from scipy.signal import cont2discrete
 
 import diffabs as d
-from diffabs.actuators import AsymmetricLag, Delay, Lag, Limits, RateLimit
-from diffabs.controllers import (
+from diffabs.core.blocks import Direct, Series
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import BrakeOutput, Clock, no_flow, no_memory
+from diffabs.core.pytree import canonical_dtypes, param, pytree, replace
+from diffabs.core.validity import check_part
+from diffabs.engine.step.runge_kutta import rk4_step
+from diffabs.linear.balance_model import BalanceModel
+from diffabs.linear.linearization import linearize, tracking_dynamics
+from diffabs.linear.opened_loop import open_loop
+from diffabs.linear.operating_point import loop_gain, operating_point
+from diffabs.linear.slip_model import LowPass, Sampling, SlipModel
+from diffabs.parts.actuators import AsymmetricLag, Delay, Lag, Limits, RateLimit
+from diffabs.parts.controllers import (
     PID,
     BackCalculation,
     ConstantTorque,
@@ -26,24 +37,13 @@ from diffabs.controllers import (
     SlidingMode,
     StateFeedback,
 )
-from diffabs.core.blocks import Direct, Series
-from diffabs.core.loop import Loop
-from diffabs.core.protocols import BrakeOutput, Clock, no_flow, no_memory
-from diffabs.core.pytree import canonical_dtypes, param, pytree, replace
-from diffabs.core.validity import check_part
-from diffabs.design.state_feedback import reduce_loop
-from diffabs.linear.balance_model import BalanceModel
-from diffabs.linear.linearization import linearize, tracking_dynamics
-from diffabs.linear.opened_loop import open_loop
-from diffabs.linear.operating_point import loop_gain, operating_point
-from diffabs.linear.slip_model import LowPass, Sampling, SlipModel
-from diffabs.plants import BrakeStart, LabRig, MirroredRig, QuarterCar
-from diffabs.references import FilteredSlip, FixedSlip, Setpoint
-from diffabs.roads import WET_ASPHALT, Burckhardt, PiecewiseLinear
+from diffabs.parts.plants import BrakeStart, LabRig, MirroredRig, QuarterCar
+from diffabs.parts.references import FilteredSlip, FixedSlip, Setpoint
+from diffabs.parts.roads import WET_ASPHALT, Burckhardt, PiecewiseLinear
+from diffabs.parts.sensors import Bias, WheelSpeed
+from diffabs.parts.stops import NoStop
+from diffabs.robust.design.state_feedback import reduce_loop
 from diffabs.scenario.defaults import braking
-from diffabs.sensors import Bias, WheelSpeed
-from diffabs.simulate.step.runge_kutta import rk4_step
-from diffabs.stops import NoStop
 
 K = 1 / 3.6
 R1, R2, J1, G = 0.0995, 0.099, 7.53e-3, 9.81
@@ -81,7 +81,7 @@ def test_rig_is_equation_21(mass, slip, speed):
     assert a.dtype == b.dtype == jnp.float64
 
 
-@killed_by("linear/linearization.py", "jax.jvp(chart, (x,), (flow(x, u),))[1]", "by_x @ flow(x, u)")
+@killed_by("linear.linearization", "jax.jvp(chart, (x,), (flow(x, u),))[1]", "by_x @ flow(x, u)")
 def test_quarter_car_by_hand():
     """slip' = ((1 - s) v' - r omega')/v at a frozen v, and mu' of Burckhardt's curve, by hand."""
     r, m, j, s, v, road = 0.2, 15.0, 1.04456, 0.1, 12.0, WET_ASPHALT
@@ -134,8 +134,8 @@ def test_tracking_away_from_equilibrium(brake):
     np.testing.assert_allclose(b, differences(lambda u: rates(z, u), u, 1e-6), rtol=1e-6, atol=1e-8)
 
 
-@killed_by("linear/linearization.py", "(narrow * NARROWER**KINK_POWER > wide) & ", "(wide < 0.0) & ")
-@killed_by("linear/linearization.py", "jnp.where(kinked, jnp.nan, x)", "jnp.where(kinked, x, x)")
+@killed_by("linear.linearization", "(narrow * NARROWER**KINK_POWER > wide) & ", "(wide < 0.0) & ")
+@killed_by("linear.linearization", "jnp.where(kinked, jnp.nan, x)", "jnp.where(kinked, x, x)")
 def test_no_slip_model_at_a_knot_of_the_friction():
     """Where the slope is 0.6 below and -0.4 above, at slip 0.2; close to the knot each side has its own model."""
     rig = MirroredRig(road=PiecewiseLinear())
@@ -158,7 +158,7 @@ def test_no_slip_model_at_a_knot_of_the_friction():
 
 
 @killed_by(
-    "linear/slip_model.py",
+    "linear.slip_model",
     "nan_at_kink(model.with_memory(system), kinked), kinked",
     "model.with_memory(system), jnp.isnan(system.B).any()",
 )
@@ -190,10 +190,10 @@ class Sled:
         return control + self.weights @ jnp.stack([force(state) for force, _ in FORCES])
 
 
-@killed_by("linear/linearization.py", "bent | (", "bent | False & (")
-@killed_by("linear/linearization.py", "MAX_SLOPE_GROWTH = 1.5", "MAX_SLOPE_GROWTH = 0.9")
-@killed_by("linear/linearization.py", "KINK_POWER = 1.1", "KINK_POWER = 1.6")
-@killed_by("linear/linearization.py", "+ MAX_ROUNDINGS * rounding", "")
+@killed_by("linear.linearization", "bent | (", "bent | False & (")
+@killed_by("linear.linearization", "MAX_SLOPE_GROWTH = 1.5", "MAX_SLOPE_GROWTH = 0.9")
+@killed_by("linear.linearization", "KINK_POWER = 1.1", "KINK_POWER = 1.6")
+@killed_by("linear.linearization", "+ MAX_ROUNDINGS * rounding", "")
 def test_a_jump_is_a_kink_and_a_power_of_1_5_is_none():
     """Dry friction at rest and a stop are kinks; Hertz contact, which has a slope everywhere, is none."""
     weights = np.eye(len(FORCES))
@@ -201,8 +201,8 @@ def test_a_jump_is_a_kink_and_a_power_of_1_5_is_none():
     np.testing.assert_allclose(found.ravel(), [slope for _, slope in FORCES], rtol=1e-12, atol=1e-6)
 
 
-@killed_by("linear/linearization.py", "narrow * NARROWER / offset > counts", "narrow > 0.0")
-@killed_by("linear/linearization.py", "NARROWER**KINK_POWER > wide", "NARROWER**3 > wide")
+@killed_by("linear.linearization", "narrow * NARROWER / offset > counts", "narrow > 0.0")
+@killed_by("linear.linearization", "NARROWER**KINK_POWER > wide", "NARROWER**3 > wide")
 def test_a_steep_curve_has_no_kink():
     """Friction that bends within a slip of 0.0001, or hardly at all."""
     slips = np.geomspace(1e-4, 0.5, 40)
@@ -254,14 +254,14 @@ class Hasty:
 
 
 @pytest.mark.slow
-@killed_by("linear/operating_point.py", 'check_kink("the loop at its setpoint", linear.kinked)\n    if', "if")
-@killed_by("linear/opened_loop.py", "plant and linear.kinked[0]", "False")
+@killed_by("linear.operating_point", 'check_kink("the loop at its setpoint", linear.kinked)\n    if', "if")
+@killed_by("linear.opened_loop", "plant and linear.kinked[0]", "False")
 @killed_by(
-    "linear/operating_point.py",
+    "linear.operating_point",
     "linear = _linearize_at_rest(model)\n    check",
     "return _linearize_at_rest(model)\n    check",
 )
-@killed_by("linear/opened_loop.py", "is_kinked(compute, moves, signal, inside)", "jnp.array(False)")
+@killed_by("linear.opened_loop", "is_kinked(compute, moves, signal, inside)", "jnp.array(False)")
 def test_no_linear_loop_at_a_kink():
     """Of the plant, the actuator, or the controller; nor where a lag rises and falls differently."""
 
@@ -291,7 +291,7 @@ def test_no_linear_loop_at_a_kink():
     assert np.sort(np.linalg.eigvals(open_loop(loop(0.8, pid, actuator=lags[1])).plant.A)) == pytest.approx([-100, -1])
 
 
-@killed_by("linear/linearization.py", "check_kink(type(plant).__name__, kinked)", "pass")
+@killed_by("linear.linearization", "check_kink(type(plant).__name__, kinked)", "pass")
 def test_a_plant_at_a_kink_has_no_linear_model():
     with pytest.raises(ValueError, match=r"^Oven: a slope jumps here, at a kink: no linear model$"):
         linearize(Oven(), Temperature(1.0), 1.0)
@@ -483,7 +483,9 @@ CASES = [
 
 
 @killed_by(
-    "design/state_feedback.py", "gain = gain * (model.speed / float(controller.reference_speed))", "gain = 1.0 * gain"
+    "robust.design.state_feedback",
+    "gain = gain * (model.speed / float(controller.reference_speed))",
+    "gain = 1.0 * gain",
 )
 @pytest.mark.parametrize(("plant", "name", "actuator"), CASES)
 def test_reduction_has_the_modes_of_the_loop(plant, name, actuator):
@@ -519,7 +521,9 @@ def test_reduction_has_the_modes_of_the_loop(plant, name, actuator):
         assert np.min(np.abs(true - mode)) < 1e-9 * max(1, abs(mode))
 
 
-@killed_by("design/state_feedback.py", "insert_unit(line, units) for line", "line.replace('{control}', 'N m') for line")
+@killed_by(
+    "robust.design.state_feedback", "insert_unit(line, units) for line", "line.replace('{control}', 'N m') for line"
+)
 def test_what_is_neglected():
     lag = Lag(time_constant=0.02)
     loop = braking(
@@ -589,8 +593,8 @@ def test_unknown_parts(parts, message):
         _ = model.states
 
 
-@killed_by("core/validity.py", "shapes = shapes or list(", "shapes = list(")
-@killed_by("linear/balance_model.py", "as_rule_array(delay) == 0", "True")
+@killed_by("core.validity", "shapes = shapes or list(", "shapes = list(")
+@killed_by("linear.balance_model", "as_rule_array(delay) == 0", "True")
 @pytest.mark.parametrize(
     ("model", "message"),
     [

@@ -16,17 +16,17 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 from scipy.signal import cont2discrete
 
-from diffabs.actuators import Delay, Lag, RateLimit
-from diffabs.controllers import PID, ConstantTorque, HoldingInput, Relay, Sampled, StateFeedback
 from diffabs.core.blocks import Series
-from diffabs.design.state_feedback import reduce_loop
 from diffabs.linear import OpenLoop, Transfer, band, from_control, margins, open_loop, to_control
 from diffabs.linear.stability_margins import find_crossovers, is_stable
-from diffabs.plants import BrakeStart, LabRig, MirroredRig
-from diffabs.references import FixedSlip
+from diffabs.parts.actuators import Delay, Lag, RateLimit
+from diffabs.parts.controllers import PID, ConstantTorque, HoldingInput, Relay, Sampled, StateFeedback
+from diffabs.parts.plants import BrakeStart, LabRig, MirroredRig
+from diffabs.parts.references import FixedSlip
+from diffabs.parts.sensors import Noise, WheelSpeed
+from diffabs.robust.design.state_feedback import reduce_loop
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import load
-from diffabs.sensors import Noise, WheelSpeed
 
 
 def rig(**parts):
@@ -54,13 +54,13 @@ def random_loop(seed, sampled):
 
 
 @killed_by(
-    "linear/stability_margins.py",
+    "linear.stability_margins",
     "phases = np.angle(-_response",
     "phases = np.angle(-1j * _response",
     case="continuous",
 )
-@killed_by("linear/stability_margins.py", "-1 / values[real]", "-values[real]", case="sampled")
-@killed_by("linear/stability_margins.py", "while high - low > 1e-9 * high:", "while False:", case="continuous")
+@killed_by("linear.stability_margins", "-1 / values[real]", "-values[real]", case="sampled")
+@killed_by("linear.stability_margins", "while high - low > 1e-9 * high:", "while False:", case="continuous")
 @pytest.mark.parametrize(
     ("sampled", "seeds"),
     [
@@ -146,8 +146,8 @@ def test_a_delay_in_continuous_time_against_the_closed_form():
 
 
 @pytest.mark.slow
-@killed_by("linear/stability_margins.py", "1 + np.floor((delays - first) * w / (2 * math.pi))", "1")
-@killed_by("linear/stability_margins.py", "2 * times if falls else -2 * times", "2 * times")
+@killed_by("linear.stability_margins", "1 + np.floor((delays - first) * w / (2 * math.pi))", "1")
+@killed_by("linear.stability_margins", "2 * times if falls else -2 * times", "2 * times")
 def test_a_delay_can_bring_back_what_it_took():
     """x'' + x = -k x'(t - d) loses stability and regains it as d grows; the counts are those with a Pade approximat."""
     k = 0.3
@@ -161,7 +161,7 @@ def test_a_delay_can_bring_back_what_it_took():
     assert is_stable(loop._replace(delay=6.0))
 
 
-@killed_by("linear/stability_margins.py", "[end for end in ends if _is_real(system, end)]", "[]")
+@killed_by("linear.stability_margins", "[end for end in ends if _is_real(system, end)]", "[]")
 def test_ends_of_the_axis():
     """A first-order loop that needs its gain, L = k/(s - 1), may lose a factor k; sampled, it turns over at z = -1."""
     one = np.ones((1, 1))
@@ -201,9 +201,9 @@ DIRECT = {
 }
 
 
-@killed_by("linear/stability_margins.py", "abs(far / (1 + far)))", "abs(far))", case="constant 2")
-@killed_by("linear/stability_margins.py", "if far < 0:", "if False:", case="D = -0.5")
-@killed_by("linear/stability_margins.py", "-abs(direct) if system.delay", "direct if True", case="constant 0.5, late")
+@killed_by("linear.stability_margins", "abs(far / (1 + far)))", "abs(far))", case="constant 2")
+@killed_by("linear.stability_margins", "if far < 0:", "if False:", case="D = -0.5")
+@killed_by("linear.stability_margins", "-abs(direct) if system.delay", "direct if True", case="constant 0.5, late")
 @pytest.mark.parametrize("name", DIRECT)
 def test_a_direct_path_counts_at_infinite_frequency(name):
     system, wanted = DIRECT[name]
@@ -213,7 +213,7 @@ def test_a_direct_path_counts_at_infinite_frequency(name):
         assert getattr(found, margin) == pytest.approx(value, rel=1e-9, nan_ok=True), margin
 
 
-@killed_by("linear/stability_margins.py", "abs(system.D[0, 0]) >= 1", "abs(system.D[0, 0]) >= 3", case="2.0")
+@killed_by("linear.stability_margins", "abs(system.D[0, 0]) >= 1", "abs(system.D[0, 0]) >= 3", case="2.0")
 @pytest.mark.parametrize("direct", [2.0, -1.5, 0.5, -0.4])
 def test_a_large_direct_path_bears_no_delay(direct):
     """1 + L e^(-s d) has zeros near s = (log(-D) + 2 pi j k)/d for large k; Newton's method finds one."""
@@ -229,8 +229,8 @@ def test_a_large_direct_path_bears_no_delay(direct):
     assert is_stable(loop._replace(delay=d)) == (s.real < 0) == (abs(direct) < 1)
 
 
-@killed_by("linear/stability_margins.py", "gained += np.round(delays / system.period)", "pass")
-@killed_by("linear/stability_margins.py", "return float(more[unstable[0]])", "return float(more[0])")
+@killed_by("linear.stability_margins", "gained += np.round(delays / system.period)", "pass")
+@killed_by("linear.stability_margins", "return float(more[unstable[0]])", "return float(more[0])")
 @pytest.mark.parametrize("count", cases([40, 200], 200))
 def test_a_sampled_loop_bears_the_periods_of_its_margin(count):
     """Poles with n periods of delay are the roots of z^n (z - p) + D (z - p) + r. Many loops have |L| > 1 at z = -1."""
@@ -312,11 +312,11 @@ HELD = {
 }
 
 
-@killed_by("linear/stability_margins.py", "if delayed.largest < REACHING:", "if True:", case="small gain at first")
+@killed_by("linear.stability_margins", "if delayed.largest < REACHING:", "if True:", case="small gain at first")
 @killed_by(
-    "linear/delay_steps.py", "np.minimum(within, remainder)", "5 * np.minimum(within, remainder)", case="short window"
+    "linear.delay_steps", "np.minimum(within, remainder)", "5 * np.minimum(within, remainder)", case="short window"
 )
-@killed_by("linear/delay_steps.py", "np.where(huge, np.fmin(alone[1:], alone[:-1]), steps)", "steps", case="no damping")
+@killed_by("linear.delay_steps", "np.where(huge, np.fmin(alone[1:], alone[:-1]), steps)", "steps", case="no damping")
 @pytest.mark.parametrize("name", HELD)
 def test_the_delay_margin_of_a_sampled_loop_is_the_first_delay_that_destabilises(name):
     loop, wanted, delays = HELD[name]
@@ -341,20 +341,20 @@ def test_every_shorter_delay_leaves_it_stable(name):
     assert all(held_loop_radius(plant, gain, period, d) < 1 for d in np.linspace(0, wanted * (1 - 1e-6), 300))
 
 
-@killed_by("linear/stability_margins.py", "if delayed.largest < REACHING:", "if False:")
+@killed_by("linear.stability_margins", "if delayed.largest < REACHING:", "if False:")
 def test_a_sampled_loop_of_small_gain_bears_every_delay():
     loop = held_loop([[-1]], [[1]], [[1]], 0.5, 0.1)
     assert margins(loop).delay == math.inf
     assert all(held_loop_radius(loop.plant, 0.5, 0.1, d) < 1 for d in np.linspace(0, 3, 100))
 
 
-@killed_by("linear/stability_margins.py", "return math.nan\n\n\ndef _bisect", "return math.inf\n\n\ndef _bisect")
+@killed_by("linear.stability_margins", "return math.nan\n\n\ndef _bisect", "return math.inf\n\n\ndef _bisect")
 def test_an_undecided_delay_margin_is_nan():
     """|L| reaches 0.995, so no delay is too long, but the reserve for peaks between points says nothing."""
     assert math.isnan(margins(held_loop([[-1]], [[1]], [[1]], 0.995, 0.1)).delay)
 
 
-@killed_by("linear/stability_margins.py", "return unstable_poles(system._replace(delay=0.0)) + int(", "return 0 * int(")
+@killed_by("linear.stability_margins", "return unstable_poles(system._replace(delay=0.0)) + int(", "return 0 * int(")
 @pytest.mark.parametrize("gain", [0.5, 3.0])
 def test_many_periods_of_delay_are_counted(gain):
     loop = held_loop([[-0.05]], [[0.05]], [[1]], gain, 0.1)
@@ -366,7 +366,7 @@ def test_many_periods_of_delay_are_counted(gain):
         assert held_loop_radius(loop.plant, gain, 0.1, found * 1.0001) > 1
 
 
-@killed_by("linear/stability_margins.py", "return np.union1d(w, between[between < half])", "return w")
+@killed_by("linear.stability_margins", "return np.union1d(w, between[between < half])", "return w")
 def test_close_crossings_are_both_found():
     """k s/(s^2 + 2 z w s + w^2) has |L| = k/(2 z w) at w, above 1 by 1e-9 between two frequencies 9e-5 z apart."""
     z, w0 = 0.5, 1.3
@@ -389,9 +389,9 @@ REFUSED = {
 }
 
 
-@killed_by("linear/transfer.py", "0 < system.period < math.inf", "True", case="period")
-@killed_by("linear/transfer.py", "if not np.isfinite(matrix).all():", "if False:", case="NaN")
-@killed_by("linear/transfer.py", "if matrices[name].shape != shape:", "if False:", case="shape")
+@killed_by("linear.transfer", "0 < system.period < math.inf", "True", case="period")
+@killed_by("linear.transfer", "if not np.isfinite(matrix).all():", "if False:", case="NaN")
+@killed_by("linear.transfer", "if matrices[name].shape != shape:", "if False:", case="shape")
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_transfer_that_cannot_be_is_refused(name):
     fields, words = REFUSED[name]
@@ -405,9 +405,9 @@ def test_lists_are_matrices():
     assert margins(lists).crossover == pytest.approx(math.sqrt(3))
 
 
-@killed_by("linear/opened_loop.py", "    check_part(loop)\n", "")
-@killed_by("linear/opened_loop.py", "if target is not None and not np.isfinite(target):", "if False:")
-@killed_by("linear/opened_loop.py", "if not 0 <= delay < np.inf:", "if False:")
+@killed_by("linear.opened_loop", "    check_part(loop)\n", "")
+@killed_by("linear.opened_loop", "if target is not None and not np.isfinite(target):", "if False:")
+@killed_by("linear.opened_loop", "if not 0 <= delay < np.inf:", "if False:")
 def test_an_open_loop_that_cannot_be_is_refused():
     for sampling, words in (
         ({"period": -0.01}, r"^controller\.period = -0\.01 is outside \(0, inf\) s$"),
@@ -426,7 +426,7 @@ def test_an_open_loop_that_cannot_be_is_refused():
         margins(loop._replace(plant=loop.plant._replace(D=np.ones((1, 1)))))
 
 
-@killed_by("linear/transfer.py", "if not 0 <= system.delay < math.inf:", "if False:", case="is_stable-None")
+@killed_by("linear.transfer", "if not 0 <= system.delay < math.inf:", "if False:", case="is_stable-None")
 @pytest.mark.parametrize("period", [None, 0.1])
 @pytest.mark.parametrize("judge", [margins, is_stable])
 def test_a_negative_delay_is_refused(judge, period):
@@ -448,7 +448,7 @@ LOOPS = {
 
 
 @killed_by(
-    "linear/opened_loop.py",
+    "linear.opened_loop",
     "delay += float(sampled.delay) if sampled else 0.0",
     "pass",
     case="sampled, half a period late",
@@ -468,7 +468,7 @@ def test_closed_is_the_loop_of_the_certificates(name):
     np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-9)
 
 
-@killed_by("linear/opened_loop.py", "target.at[0].set(around.setpoint) if around.frozen else target", "target")
+@killed_by("linear.opened_loop", "target.at[0].set(around.setpoint) if around.frozen else target", "target")
 @pytest.mark.slow
 def test_the_brake_lab_rig_and_a_filtered_sensor_come_to_rest():
     lab = rig(plant=LabRig(), initial=BrakeStart(speed=14.0), controller=StateFeedback(gain=(-60.0, -4.0)))
@@ -484,7 +484,7 @@ def test_the_brake_lab_rig_and_a_filtered_sensor_come_to_rest():
 
 
 @killed_by(
-    "linear/opened_loop.py",
+    "linear.opened_loop",
     "delay = float(sum(block.time for block in blocks if isinstance(block, Delay)))",
     "delay = 0.0",
 )
@@ -498,7 +498,7 @@ def test_a_pure_delay_turns_the_phase_and_nothing_else():
     assert other.delay == pytest.approx(one.delay - 1e-3, rel=1e-9)
 
 
-@killed_by("linear/opened_loop.py", "remainder = max(delay - whole * self.period, 0.0)", "remainder = 0.0")
+@killed_by("linear.opened_loop", "remainder = max(delay - whole * self.period, 0.0)", "remainder = 0.0")
 @pytest.mark.slow
 def test_a_sampled_loop_with_delay_fits_its_step_response():
     """2.6 periods of delay: the pulse response of L(z) is that of the continuous plant, which has one state."""
@@ -522,7 +522,7 @@ def test_a_sampled_loop_with_delay_fits_its_step_response():
 
 @pytest.mark.slow
 @killed_by(
-    "linear/stability_margins.py", "if loop.period is None:\n        return guess", "if True:\n        return guess"
+    "linear.stability_margins", "if loop.period is None:\n        return guess", "if True:\n        return guess"
 )
 def test_a_sampled_loop_is_unstable_beyond_its_delay_margin():
     loop = rig(controller=Sampled(controller=StateFeedback(gain=(-3000.0, -48.0)), period=4e-3))
@@ -541,8 +541,8 @@ def closed_poles(system):
     return np.linalg.eigvals(system.A - system.B @ system.C)
 
 
-@killed_by("linear/opened_loop.py", "TARGET_OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)", "TARGET_OFFSETS = (0.0,)")
-@killed_by("core/tracing.py", "lambda step: not _zero(step)", "lambda step: True")
+@killed_by("linear.opened_loop", "TARGET_OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)", "TARGET_OFFSETS = (0.0,)")
+@killed_by("core.tracing", "lambda step: not _zero(step)", "lambda step: True")
 @pytest.mark.slow
 def test_noise_is_a_disturbance_and_limits_do_not_act():
     plain = open_loop(rig()).transfer()
@@ -574,7 +574,7 @@ def test_what_has_no_linear_loop_says_why(parts, words):
         open_loop(rig(**parts))
 
 
-@killed_by("linear/transfer.py", "for _ in range(self.count_periods()):", "for _ in range(0):")
+@killed_by("linear.transfer", "for _ in range(self.count_periods()):", "for _ in range(0):")
 def test_python_control_there_and_back():
     system = random_loop(3, True)._replace(delay=0.0)
     back = from_control(to_control(system))
@@ -595,7 +595,7 @@ def test_python_control_there_and_back():
 
 
 @pytest.mark.slow
-@killed_by("linear/robustness.py", "return {name: max(self.systems", "return {name: min(self.systems")
+@killed_by("linear.robustness", "return {name: max(self.systems", "return {name: min(self.systems")
 def test_a_band_is_of_the_corners_and_of_samples_between():
     loop, over = rig(), {"plant.mass": (5.3, 6.2), "initial.speed": (2.0, 10.0)}
     found = band(loop, over, samples=5)
@@ -669,7 +669,7 @@ def companion(*rates):
     return a, np.eye(len(rates))[:, -1:], np.eye(len(rates))[:1]
 
 
-@killed_by("linear/stability_margins.py", "MAX_RANGE_STEPS = 1e-60, 4", "MAX_RANGE_STEPS = 1e-9, 4", case="1e-30")
+@killed_by("linear.stability_margins", "MAX_RANGE_STEPS = 1e-60, 4", "MAX_RANGE_STEPS = 1e-9, 4", case="1e-30")
 @pytest.mark.parametrize("c", [1e-30, 1e-12, 1.0, 1e15])
 def test_margins_do_not_depend_on_the_unit_of_time(c):
     """L = 2 c^3/(s (s + c)(s + 2c)): gain 3; the rest is of c = 1, by bisection of |L| = 1 here."""
@@ -683,7 +683,7 @@ def test_margins_do_not_depend_on_the_unit_of_time(c):
     assert found.sensitivity == pytest.approx(2.3123140146, rel=1e-9)
 
 
-@killed_by("linear/stability_margins.py", "for way in (-1, 1):", "for way in ():", case="1e-12")
+@killed_by("linear.stability_margins", "for way in (-1, 1):", "for way in ():", case="1e-12")
 @pytest.mark.parametrize("k", [1e-14, 1e-12, 1e15])
 def test_a_crossover_far_below_a_pole_is_found(k):
     """k/(s (s + 1)): w^2 = (sqrt(1 + 4 k^2) - 1)/2, and the phase margin is 90 deg less atan(w)."""
@@ -693,7 +693,7 @@ def test_a_crossover_far_below_a_pole_is_found(k):
     assert (found.crossover, found.phase) == pytest.approx((w, np.arctan(1 / w)), rel=1e-9)
 
 
-@killed_by("linear/stability_margins.py", "crossovers = _touch_unit_circle(system, w, crossovers)", "pass")
+@killed_by("linear.stability_margins", "crossovers = _touch_unit_circle(system, w, crossovers)", "pass")
 def test_a_gain_that_only_reaches_one_has_a_phase_margin():
     """A sampled gain of 1 is 180 deg from -1 at every frequency; 2 s/(s + 1)^2 is 1 at 1 rad/s and less elsewhere."""
     found = margins(static(1.0, period=0.1))
@@ -704,9 +704,7 @@ def test_a_gain_that_only_reaches_one_has_a_phase_margin():
     assert np.isinf(margins(static(0.999, period=0.1)).phase)
 
 
-@killed_by(
-    "linear/transfer.py", "np.expm1(1j * w * self.period)", "np.exp(1j * w * self.period) - 1", case="1e-09-0.001"
-)
+@killed_by("linear.transfer", "np.expm1(1j * w * self.period)", "np.exp(1j * w * self.period) - 1", case="1e-09-0.001")
 @pytest.mark.parametrize(("period", "k"), [(1e-6, 0.1), (1e-9, 0.1), (1e-9, 1e-3)])
 def test_a_fast_sampled_integrator_has_the_margins_of_its_formula(period, k):
     """k T/(z - 1): |L| = 1 at sin(w T/2) = k T/2; a lag of m periods reaches -1 at m w T = pi/2 - w T/2."""

@@ -19,7 +19,7 @@ from diffabs.linear.regulator import dlqr, lqr
 from diffabs.linear.riccati import care, dare
 from diffabs.linear.stabilisability import unstabilisable_mode
 from diffabs.linear.weights import is_symmetric
-from diffabs.plants import ArmBalance
+from diffabs.parts.plants import ArmBalance
 
 ALPHA, BETA, FAST, SLOW = 83.8796606703, 133.472842636189, 140.291806958, 14.0291806958
 CARE, DARE = jax.jit(care), jax.jit(dare)
@@ -52,13 +52,13 @@ def relative(a, b):
 
 
 @killed_by(
-    "linear/riccati_batched.py",
+    "linear.riccati_batched",
     "a, q = A - times(B, transpose(S)), Q - times(S, transpose(S))",
     "a, q = A, Q",
     case="2",
 )
 @killed_by(
-    "linear/riccati_batched.py",
+    "linear.riccati_batched",
     "return whole[:n, :n], -whole[:n, n:], whole[n:, :n]",
     "return whole[:n, :n], whole[:n, n:], -whole[n:, :n]",
     case="2",
@@ -84,7 +84,7 @@ def test_dare_is_scipys(n):
 
 
 @killed_by(
-    "linear/regulator.py",
+    "linear.regulator",
     "return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R, riccati.P.dtype)), turned)",
     "return Regulator(jnp.linalg.solve(symmetric_part(jnp.asarray(R, riccati.P.dtype)), turned)",
     case="q1-140.291806958",
@@ -142,7 +142,7 @@ def test_lyapunov_equations_are_scipys():
         assert found.residual < 1e-13
 
 
-@killed_by("linear/lyapunov.py", "jnp.linalg.solve(operator, -Q.ravel())", "jnp.linalg.lstsq(operator, -Q.ravel())[0]")
+@killed_by("linear.lyapunov", "jnp.linalg.solve(operator, -Q.ravel())", "jnp.linalg.lstsq(operator, -Q.ravel())[0]")
 @pytest.mark.parametrize(("solve", "modes"), [(lyapunov, (1.0, -1.0, 0.5)), (discrete_lyapunov, (2.0, 0.5, 0.3))])
 def test_a_singular_lyapunov_equation_has_a_huge_solution(solve, modes):
     for seed in range(6):
@@ -248,7 +248,7 @@ def test_derivative_where_an_input_costs_nothing():
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * h), rtol=1e-6, atol=1e-6 * np.abs(slope).max())
 
 
-@killed_by("linear/riccati.py", "if B.dtype != jnp.float64:", "if False:", case="care")
+@killed_by("linear.riccati", "if B.dtype != jnp.float64:", "if False:", case="care")
 @pytest.mark.parametrize("solve", [care, dare, lqr, dlqr])
 def test_single_precision_is_refused(solve):
     """Where every P would be NaN, because none is proven to 1e-7."""
@@ -294,9 +294,9 @@ def skewed_problem():
     return a, b, q + np.triu(np.ones((3, 3)), 1), r + np.array([[0.0, 0.4], [-0.6, 0.0]])
 
 
-@killed_by("linear/gaussian.py", "C @ riccati.P @ C.T + symmetric_part(V)", "C @ riccati.P @ C.T + V", case="kalman")
-@killed_by("linear/regulator.py", "symmetric_part(jnp.asarray(R, riccati.P.dtype))", "jnp.asarray(R)", case="lqr")
-@killed_by("linear/regulator.py", "symmetric_part(jnp.asarray(R)) + b.T", "jnp.asarray(R) + b.T", case="dlqr")
+@killed_by("linear.gaussian", "C @ riccati.P @ C.T + symmetric_part(V)", "C @ riccati.P @ C.T + V", case="kalman")
+@killed_by("linear.regulator", "symmetric_part(jnp.asarray(R, riccati.P.dtype))", "jnp.asarray(R)", case="lqr")
+@killed_by("linear.regulator", "symmetric_part(jnp.asarray(R)) + b.T", "jnp.asarray(R) + b.T", case="dlqr")
 @pytest.mark.parametrize("name", GAINS)
 def test_traced_weights_count_by_their_symmetric_part(name):
     numbers = skewed_problem()
@@ -315,7 +315,7 @@ def test_traced_weights_count_by_their_symmetric_part_in_the_derivative(name):
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * h), rtol=1e-6, atol=1e-7)
 
 
-@killed_by("linear/gaussian.py", "check_symmetric(name, covariance, size)", "pass", case="W")
+@killed_by("linear.gaussian", "check_symmetric(name, covariance, size)", "pass", case="W")
 @pytest.mark.parametrize("name", ["W", "V"])
 def test_a_covariance_that_is_not_symmetric_is_refused(name):
     wrong = np.array([[1.0, 0.8], [-0.8, 1.0]])
@@ -323,9 +323,9 @@ def test_a_covariance_that_is_not_symmetric_is_refused(name):
         kalman(**{"A": 0.5 * np.eye(2), "C": np.eye(2), "W": np.eye(2), "V": np.eye(2), name: wrong})
 
 
-@killed_by("linear/gaussian.py", 'as_weight_matrix(name, covariance, size, definite=name == "V")', "pass")
-@killed_by("linear/gaussian.py", 'definite=name == "V"', "definite=False")
-@killed_by("linear/gaussian.py", 'definite=name == "V"', "definite=True")
+@killed_by("linear.gaussian", 'as_weight_matrix(name, covariance, size, definite=name == "V")', "pass")
+@killed_by("linear.gaussian", 'definite=name == "V"', "definite=False")
+@killed_by("linear.gaussian", 'definite=name == "V"', "definite=True")
 def test_the_filter_needs_covariances():
     """Unlike a regulator's Q: a variance is not negative, and V has an inverse. Without w a stable state is known."""
     for w, v, message in ((-0.1, 1.0, "W is not positive semidefinite"), (1.0, 0.0, "V is not positive definite")):
@@ -334,14 +334,14 @@ def test_the_filter_needs_covariances():
     np.testing.assert_allclose(kalman([[0.5]], [[1.0]], [[0.0]], [[1.0]]).P, 0.0, atol=1e-12)
 
 
-@killed_by("linear/gaussian.py", "(jnp.isfinite(noise) & (noise > 0)).all()", "True")
+@killed_by("linear.gaussian", "(jnp.isfinite(noise) & (noise > 0)).all()", "True")
 @pytest.mark.parametrize("noise", [(0.0, 1e-3), (1e-3, -1e-3), (np.nan, 1e-3), (1e-3, np.inf)], ids=str)
 def test_a_sensor_without_noise_has_no_filter(noise):
     with pytest.raises(ValueError, match=r"^noise = \[.*\] is outside \(0, inf\) rad$"):
         lqg(ArmBalance(), np.eye(6), 1.0, noise=noise)
 
 
-@killed_by("linear/weights.py", "np.outer(scale, scale)", "0.0")
+@killed_by("linear.weights", "np.outer(scale, scale)", "0.0")
 def test_rounding_does_not_make_a_matrix_unsymmetric():
     """A product F P F' has small entries that are all rounding; differences far above rounding are refused."""
     product = np.array([[1e8, 3e-9], [-2e-9, 1e8]])
@@ -363,7 +363,7 @@ def scalar(solver, weights):
     return lambda *data: jnp.sum(weights * solver(*data).P)
 
 
-@killed_by("linear/riccati.py", "closed = A - B @ jnp.linalg.solve(R, B.T @ P + S.T)", "closed = A", case="care")
+@killed_by("linear.riccati", "closed = A - B @ jnp.linalg.solve(R, B.T @ P + S.T)", "closed = A", case="care")
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", [care, dare])
 def test_gradients_are_differences(solver):
@@ -450,7 +450,7 @@ def test_repeated_poles_and_unseen_unstable_modes():
         assert np.linalg.eigvals(closed).real.max() < -0.9
 
 
-@killed_by("linear/riccati_batched.py", "return jnp.where((error <= limit) & (moved <= limit), P, jnp.nan)", "return P")
+@killed_by("linear.riccati_batched", "return jnp.where((error <= limit) & (moved <= limit), P, jnp.nan)", "return P")
 def test_nearly_unstabilisable_is_right_or_reported():
     reported = 0
     for coupling in 10.0 ** -np.arange(0.0, 15.0):
@@ -498,7 +498,7 @@ def test_no_silent_failure_among_a_thousand():
         ({"S": np.array([[np.inf], [0.0]])}, "^S has an entry that is not finite$"),
     ],
 )
-@killed_by("linear/regulator.py", "not isinstance(S, Tracer) and", "False and")
+@killed_by("linear.regulator", "not isinstance(S, Tracer) and", "False and")
 def test_bad_matrices(change, message):
     a, b = rig()
     given = {"A": a, "B": b, "Q": np.eye(2), "R": np.eye(1)} | change
@@ -509,8 +509,8 @@ def test_bad_matrices(change, message):
             regulator(**given)
 
 
-@killed_by("linear/regulator.py", "if not b.size:", "if False:", case="lqr-no input")
-@killed_by("linear/riccati.py", "if not B.size:", "if False:", case="care-no state")
+@killed_by("linear.regulator", "if not b.size:", "if False:", case="lqr-no input")
+@killed_by("linear.riccati", "if not B.size:", "if False:", case="care-no state")
 @pytest.mark.parametrize(("n", "m"), [(0, 1), (2, 0)], ids=["no state", "no input"])
 @pytest.mark.parametrize("solve", [lqr, dlqr, care, dare])
 def test_a_system_without_states_or_inputs_is_refused(solve, n, m):
@@ -518,8 +518,8 @@ def test_a_system_without_states_or_inputs_is_refused(solve, n, m):
         solve(-np.eye(n), np.zeros((n, m)), np.eye(n), np.eye(m))
 
 
-@killed_by("linear/riccati_batched.py", "max(lanes, 1)", "lanes")
-@killed_by("linear/riccati_batched.py", "P.reshape(*lanes, *P.shape[1:])", "P.reshape(axis_size, -1, *P.shape[1:])")
+@killed_by("linear.riccati_batched", "max(lanes, 1)", "lanes")
+@killed_by("linear.riccati_batched", "P.reshape(*lanes, *P.shape[1:])", "P.reshape(axis_size, -1, *P.shape[1:])")
 @pytest.mark.parametrize("batch", [(0,), (0, 3), (3, 0)], ids=str)
 def test_a_batch_may_be_empty(batch):
     def solve(a):
@@ -570,11 +570,9 @@ def stiff_chain(random, n):
     return np.diag(rates) + np.diag(10.0 ** random.uniform(-6, 6, n - 1), 1), np.eye(n)[:, -1:]
 
 
-@killed_by("linear/stabilisability.py", "* scales[0][:, None] * scales[1]", "")
-@killed_by("linear/stabilisability.py", "return -states - np.log(rates)", "return 0.0 * states")
-@killed_by(
-    "linear/stabilisability.py", "if discrete else np.real(mode) >= -error", "if discrete else np.real(mode) >= 0"
-)
+@killed_by("linear.stabilisability", "* scales[0][:, None] * scales[1]", "")
+@killed_by("linear.stabilisability", "return -states - np.log(rates)", "return 0.0 * states")
+@killed_by("linear.stabilisability", "if discrete else np.real(mode) >= -error", "if discrete else np.real(mode) >= 0")
 def test_units_do_not_decide_what_is_stabilisable():
     """Distinct rates in series make every mode movable; a hidden mode stays hidden. Units differ by up to 1e16."""
     random = np.random.default_rng(3)
@@ -588,7 +586,7 @@ def test_units_do_not_decide_what_is_stabilisable():
                 assert (mode is not None) == unmoved, (k, units, mode)
 
 
-@killed_by("linear/stabilisability.py", "reached |= (a[:, reached] != 0).any(axis=1)", "pass")
+@killed_by("linear.stabilisability", "reached |= (a[:, reached] != 0).any(axis=1)", "pass")
 def test_a_state_behind_no_input_is_not_moved():
     """No entry leads from the input to the last state, however large the units make the others."""
     a = np.array([[1.0, 1e12, 0.0], [0.0, -2.0, 1e12], [0.0, 0.0, 1e-9]])

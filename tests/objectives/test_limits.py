@@ -15,7 +15,7 @@ from diffabs import actuators, controllers, objectives, references, stops
 from diffabs.cli.show import numbers_at_bounds
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import param, pytree
-from diffabs.objectives import SettlingTime, at_limits
+from diffabs.parts.objectives import SettlingTime, at_limits
 
 
 class Position(NamedTuple):
@@ -80,7 +80,7 @@ def test_a_run_says_for_how_long_its_control_is_at_a_limit():
     assert at_limits(pulled(controllers.Relay())).high == np.inf  # levels, not limits
 
 
-@killed_by("objectives/tracking.py", "smaller(memory.held / jnp.where(t > 0, t, 1.0), 1.0)", "memory.held / t")
+@killed_by("parts.objectives.tracking", "smaller(memory.held / jnp.where(t > 0, t, 1.0), 1.0)", "memory.held / t")
 def test_a_run_always_at_a_limit_is_valid():
     """In single precision the sum of 1,333 steps exceeds their end by 2e-5."""
     loop = d.replace(d.braking(), {"controller.high": 2.0, "controller.kp": 500.0})
@@ -88,7 +88,7 @@ def test_a_run_always_at_a_limit_is_valid():
         assert d.measure(loop, d.FixedStep(3e-3, 4.0), {"share": at_limits(loop)}).metrics["share"] == 1.0
 
 
-@killed_by("actuators/motor.py", "return -self.high, self.high", "return -1e9, 1e9")
+@killed_by("parts.actuators.motor", "return -self.high, self.high", "return -1e9, 1e9")
 def test_the_limits_are_those_of_the_command():
     """Of a motor's supply. A valve's command is a rate, which its limits do not bound."""
     limits = at_limits(pulled(WEAK, actuator=actuators.VoltageLimit(high=24.0)))

@@ -104,9 +104,9 @@ ROOT = math.sqrt(1 - ZETA**2)
 FRACTION = math.exp(-math.pi * ZETA / ROOT)
 
 
-@killed_by("objectives/tracking.py", "setpoint - lowest)", "highest - setpoint)")
-@killed_by("objectives/tracking.py", "jnp.nan, jnp.abs(step))", "jnp.nan, jnp.abs(setpoint))")
-@killed_by("objectives/tracking.py", "jnp.abs(step) <= rounding", "step != step")
+@killed_by("parts.objectives.tracking", "setpoint - lowest)", "highest - setpoint)")
+@killed_by("parts.objectives.tracking", "jnp.nan, jnp.abs(step))", "jnp.nan, jnp.abs(setpoint))")
+@killed_by("parts.objectives.tracking", "jnp.abs(step) <= rounding", "step != step")
 def test_overshoot_and_settling_time_are_relative_to_the_step():
     """Against the closed form; RK4 and the cubics leave 1e-9, and 1 part in 1e5 of the step from 1000 loses 1e-9."""
     first, value = STEPS.T

@@ -14,7 +14,7 @@ from diffabs.core.cubic import Cubic
 from diffabs.core.messages import Segment
 from diffabs.core.numerics import later_of_larger
 from diffabs.core.protocols import Shown
-from diffabs.objectives import PeakVoltage
+from diffabs.parts.objectives import PeakVoltage
 
 
 def step(h, smooth, within=(True, True), **signals):
@@ -27,7 +27,7 @@ def step(h, smooth, within=(True, True), **signals):
     return Segment(a, b, h, h, lambda: (Shown.of(da), Shown.of(db)), lambda: (da, db), smooth, within)
 
 
-@killed_by("objectives/balance.py", "if segment.smooth is not False:", "if False:", case="True-24.0")
+@killed_by("parts.objectives.balance", "if segment.smooth is not False:", "if False:", case="True-24.0")
 @pytest.mark.parametrize(("smooth", "peak"), [(True, 24.0), (False, 19.2)])
 def test_a_voltage_rises_and_falls_within_a_long_step(smooth, peak):
     """u = 24 - 30 (t - 0.4)^2 over a step of 1 s. If the step would not end on a limit, only its ends are seen."""
@@ -36,7 +36,7 @@ def test_a_voltage_rises_and_falls_within_a_long_step(smooth, peak):
     np.testing.assert_allclose(objective.update(objective.start(segment.start), segment), peak, rtol=1e-12)
 
 
-@killed_by("core/messages.py", "jnp.where(end, last, jnp.where(start, 2.0 * rise - first, rise))", "last")
+@killed_by("core.messages", "jnp.where(end, last, jnp.where(start, 2.0 * rise - first, rise))", "last")
 @pytest.mark.parametrize(("objective", "value"), [(PeakVoltage(), 24.0), (objectives.Variation(), 4.0)])
 def test_a_voltage_that_rises_to_a_limit_does_not_leave_it(objective, value):
     """u = 20 + 8 t to 24, where the step ends and the voltage falls: its slope there says nothing about the step."""
@@ -157,8 +157,8 @@ def test_a_cubic_without_a_root_returns_its_end():
     assert jax.jvp(place, (-1.0,), (1.0,))[0] < 1.0
 
 
-@killed_by("core/cubic.py", " & (self.end_slope < 0)", "")
-@killed_by("core/cubic.py", "(self.start_slope > 0) &", "")
+@killed_by("core.cubic", " & (self.end_slope < 0)", "")
+@killed_by("core.cubic", "(self.start_slope > 0) &", "")
 def test_the_greatest_value_of_any_cubic():
     """Against NumPy's roots; some values and slopes at the ends are zero. It is the greater end if the cubic does not
     rise at the start and fall at the end: a control that leaves its limit at a step's end has no peak before it."""
@@ -172,7 +172,7 @@ def test_the_greatest_value_of_any_cubic():
         np.testing.assert_allclose(greatest, max(a, b, *curve(np.array(inside))), rtol=1e-9, atol=1e-12)
 
 
-@killed_by("core/numerics.py", "jnp.where(jnp.greater(short, 0), short, 0.0)", "0.0")
+@killed_by("core.numerics", "jnp.where(jnp.greater(short, 0), short, 0.0)", "0.0")
 def test_a_maximum_does_not_follow_a_slow_decline():
     """In single precision 0.9999 is equal to 1 within the rounding that decides about derivatives."""
 

@@ -119,7 +119,7 @@ def test_a_dumb_terminal_gets_plain_text(name, monkeypatch):
     assert plain.split() == drawn(SUMMARIES[name]()).split()
 
 
-@killed_by("papers/digest.py", 'return row["matches"] if "matches" in row else', 'return True if "matches" in row else')
+@killed_by("papers.digest", 'return row["matches"] if "matches" in row else', 'return True if "matches" in row else')
 def test_published_numbers_are_counted_from_the_record():
     assert "20 of 20 published numbers reproduced (Tables 1, 2: to the printed digit)." in drawn(estimator())
     off = papers.compact(estimator(**{"proposed PI": 0.0051}))
@@ -143,8 +143,8 @@ def test_what_counts_as_an_independent_number_reproduced(ours, reference, agrees
     assert count_computed([row]).startswith("1 of 1" if agrees else "0 of 1")
 
 
-@killed_by("papers/digest.py", 'return row["ours"] == reference', "return False")
-@killed_by("papers/digest.py", "not isinstance(number, str) and ", "")
+@killed_by("papers.digest", 'return row["ours"] == reference', "return False")
+@killed_by("papers.digest", "not isinstance(number, str) and ", "")
 def test_a_word_is_reproduced_by_the_same_word():
     """A stop that is never reached has no difference from a number."""
     rows = [
@@ -159,7 +159,7 @@ def test_decimals_are_those_that_are_written():
     assert [decimals(x) for x in (46.5, 479.0, 1000.0, 1e-5, -0.00257, 0.0)] == [1, 0, 0, 5, 5, 0]
 
 
-@killed_by("papers/digest.py", "if claim.false(*values)", "if True")
+@killed_by("papers.digest", "if claim.false(*values)", "if True")
 def test_a_claim_is_refuted_by_the_number_or_holds():
     words = dict.fromkeys(word for word, _ in papers.compact(estimator()).verdicts)
     assert list(words) == ["refuted"]

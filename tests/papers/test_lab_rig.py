@@ -12,8 +12,8 @@ from mutants import killed_by
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from diffabs.config.values import ScenarioError
 from diffabs.core.pytree import get, replace
+from diffabs.host.values import ScenarioError
 from diffabs.papers import REPRODUCTIONS, compact, lab_rig
 from diffabs.papers import measured_rig as rig
 from diffabs.papers.record import computed_row, format_time
@@ -45,7 +45,7 @@ def test_the_makers_simulations_are_those_of_the_mask():
 
 
 @killed_by(
-    "papers/lab_rig.py",
+    "papers.lab_rig",
     "jnp.exp(-self.friction * t / self.inertia) - dry",
     "jnp.exp(-self.friction * t / self.inertia)",
 )
@@ -108,7 +108,7 @@ def brake_by_scipy(plant, command, speed, end):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("which", "command"), [("mask", 0.75), ("identified", 0.65)])
-@killed_by("papers/lab_rig.py", "np.interp(curves.t + shift, t, wheel)", "np.interp(curves.t, t, wheel)")
+@killed_by("papers.lab_rig", "np.interp(curves.t + shift, t, wheel)", "np.interp(curves.t, t, wheel)")
 def test_step_braking_against_scipy(which, command):
     """The errors have the resolution of a step of 0.125 ms; the wheel slows down by 20 % in 10 ms."""
     identified = load("lab-rig-measured").loop.plant
@@ -130,7 +130,7 @@ def test_step_braking_against_scipy(which, command):
     np.testing.assert_allclose(found["fall_time"], crossing(0.2) - crossing(0.8), rtol=1e-3)
 
 
-@killed_by("papers/lab_rig.py", '"brake_gain", command)', '"brake_gain", 1.0)')
+@killed_by("papers.lab_rig", '"brake_gain", command)', '"brake_gain", 1.0)')
 @pytest.mark.slow
 def test_step_braking_asks_for_the_friction_of_the_mask():
     """INTECO's formula (6.2.6) gives 6.2, 8.4 and 9.7 N m for these curves, with the larger inertia of the manual."""
@@ -164,8 +164,8 @@ def write_record(folder, experiment, first, last):
     (folder / f"{experiment.name}.csv").write_text("\n".join(lines))
 
 
-@killed_by("papers/measured_rig.py", "np.inf if moves[-1] else ", "")
-@killed_by("papers/record.py", "ours if isinstance(ours, str) else float(ours)", "float(ours)")
+@killed_by("papers.measured_rig", "np.inf if moves[-1] else ", "")
+@killed_by("papers.record", "ours if isinstance(ours, str) else float(ours)", "float(ours)")
 def test_a_record_that_ends_before_standstill(tmp_path):
     """It shows no stop; tables say so in a word."""
     experiment = rig.EXPERIMENTS[0]
@@ -184,7 +184,7 @@ def test_a_record_that_ends_before_standstill(tmp_path):
 
 
 @pytest.mark.slow
-@killed_by("papers/measured_rig.py", " if run.stopped else np.inf", "")
+@killed_by("papers.measured_rig", " if run.stopped else np.inf", "")
 def test_a_run_that_ends_before_standstill(tmp_path):
     """That of 0.3 s and one more: it has no stop, and its summary is JSON."""
     write_record(tmp_path, rig.EXPERIMENTS[0], 0, 30)
@@ -195,7 +195,7 @@ def test_a_run_that_ends_before_standstill(tmp_path):
     json.dumps(judged, allow_nan=False)
 
 
-@killed_by("papers/measured_rig.py", "t[0] <= experiment.start + 0.5 * PERIOD", "True")
+@killed_by("papers.measured_rig", "t[0] <= experiment.start + 0.5 * PERIOD", "True")
 def test_a_record_that_begins_late_is_refused(tmp_path):
     """Its first row would count as the start of the brake."""
     experiment = rig.EXPERIMENTS[1]
@@ -206,9 +206,9 @@ def test_a_record_that_begins_late_is_refused(tmp_path):
         rig.read_record(experiment, tmp_path)
 
 
-@killed_by("papers/measured_rig.py", "TypeError, ValueError, csv.Error", "TypeError, csv.Error", case="no UTF-8")
-@killed_by("papers/measured_rig.py", "ValueError, csv.Error", "ValueError", case="a long cell")
-@killed_by("papers/measured_rig.py", "< MIN_KNOWN:", "< 0:", case="at rest")
+@killed_by("papers.measured_rig", "TypeError, ValueError, csv.Error", "TypeError, csv.Error", case="no UTF-8")
+@killed_by("papers.measured_rig", "ValueError, csv.Error", "ValueError", case="a long cell")
+@killed_by("papers.measured_rig", "< MIN_KNOWN:", "< 0:", case="at rest")
 @pytest.mark.parametrize(
     ("row", "needed"),
     [
@@ -248,8 +248,8 @@ def test_the_packaged_scenario_follows_experiment_1():
     assert seen.stop_time == pytest.approx(record.stop_time, rel=0.04)  # 3.12 s; measured 3.01
 
 
-@killed_by("papers/measured_rig.py", "jnp.where(running[now], measured.slip[held], 0.0)", "measured.slip[held]")
-@killed_by("papers/measured_rig.py", "jnp.where(running, output", "jnp.where(True, output")
+@killed_by("papers.measured_rig", "jnp.where(running[now], measured.slip[held], 0.0)", "measured.slip[held]")
+@killed_by("papers.measured_rig", "jnp.where(running, output", "jnp.where(True, output")
 def test_after_its_end_a_run_shows_a_driver_at_rest():
     """A trajectory repeats its last sample; the record shows 0 there. The run ends at 24 ms, in the third period."""
     step, radius, end = 2e-3, 0.1, 12
@@ -269,7 +269,7 @@ def test_after_its_end_a_run_shows_a_driver_at_rest():
 
 
 @pytest.mark.slow
-@killed_by("papers/measured_rig.py", "t - recorded.counter_lag", "t")
+@killed_by("papers.measured_rig", "t - recorded.counter_lag", "t")
 @pytest.mark.parametrize("path", ["loop.actuator.rise", "loop.actuator.fall", "loop.plant.brake_rate", "counter_lag"])
 def test_derivatives_of_the_readings_agree_with_differences(path):
     """Through the events of the dead time, at three widths; the readings are those of the first 0.3 s."""

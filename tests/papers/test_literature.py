@@ -16,11 +16,11 @@ from scipy.optimize import minimize_scalar
 from diffabs import BrakeStart, braking
 from diffabs.papers import literature
 from diffabs.papers.literature import bound_of_loop, bound_of_stop, judge_row, read_rows, read_sources
-from diffabs.plants import QuarterCar
-from diffabs.roads import Burckhardt
+from diffabs.parts.plants import QuarterCar
+from diffabs.parts.roads import Burckhardt
+from diffabs.parts.stops import SpeedReached, Standstill
 from diffabs.scenario.registry import family_types
 from diffabs.scenario.scenario import load, names
-from diffabs.stops import SpeedReached, Standstill
 
 FOLDER = ROOT / "experiments" / "literature"
 VERDICTS = {"reproduced", "refuted", "undecidable"}
@@ -46,7 +46,7 @@ def test_every_scenario_of_the_literature_has_a_row():
     }
 
 
-@killed_by("papers/literature.py", "math.sqrt(a * c) if c", "math.sqrt(c / a) if c")
+@killed_by("papers.literature", "math.sqrt(a * c) if c", "math.sqrt(c / a) if c")
 @pytest.mark.parametrize("c", [0.0, 2e-3])
 def test_bounds_are_those_of_the_ordinary_differential_equation(c):
     a, first, last = 8.8, 30.0, 0.3
@@ -79,7 +79,7 @@ def test_bounds_of_an_independent_program(scenario, kind, bound):
         np.testing.assert_allclose(bound_of_loop(load(scenario, integrated=False).loop, row), bound, rtol=2e-4)
 
 
-@killed_by("papers/literature.py", "np.array([[first], [last]])", "np.array([[first]])")
+@killed_by("papers.literature", "np.array([[first], [last]])", "np.array([[first]])")
 def test_a_bound_has_the_friction_of_the_slowest_speed():
     """Which is the greatest one of Burckhardt's: mu = (c1 (1 - exp(-c2 s)) - c3 s) exp(-c4 s v). The least time that
     any slip takes at each speed is longer than the bound."""
@@ -123,7 +123,7 @@ def committed_row(source, quantity):
     return next(row for row in committed()["rows"] if (row["source"], row["quantity"]) == (source, quantity))
 
 
-@killed_by("papers/literature.py", "[*overrides, *near]", "overrides")
+@killed_by("papers.literature", "[*overrides, *near]", "overrides")
 def test_a_row_whose_verdict_changes_nearby_is_undecidable(monkeypatch):
     """0.4 s over 3.5 is refuted; with a torque of 798 the number agrees."""
     row = {"source": "a", "quantity": "b", "unit": "s", "place": "c", "printed": 3.5, "tolerance": 0.04}
@@ -224,8 +224,8 @@ def position_by_matrix_exponential(plant, kp, ki, target, period, samples):
     return np.array(positions)
 
 
-@killed_by("papers/literature.py", 'np.interp(row["at"]', 'np.interp(row["at"] + 1e-4')
-@killed_by("scenario/outside.py", "_named.clear()", "pass")
+@killed_by("papers.literature", 'np.interp(row["at"]', 'np.interp(row["at"] + 1e-4')
+@killed_by("scenario.outside", "_named.clear()", "pass")
 def test_the_electro_mechanical_brake_has_the_printed_digits():
     """The scenario's step of a tenth of the period has an error of 2e-15 m."""
     with jax.enable_x64(True):

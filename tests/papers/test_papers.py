@@ -16,12 +16,13 @@ from mutants import killed_by
 from reports import Page
 from rich.console import Console
 
-from diffabs import FixedStep, plot, rollout
+from diffabs import FixedStep, rollout
 from diffabs.cli import show
-from diffabs.objectives import BRAKING
+from diffabs.output import plot
+from diffabs.output.report import build_report, find_documents
 from diffabs.papers import PAPERS, REPRODUCTIONS, arm_balance, compact, lmi_design, record, slip_estimator, slip_lmi
-from diffabs.references import FixedSlip
-from diffabs.report import build_report, find_documents
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.references import FixedSlip
 from diffabs.scenario.defaults import braking
 
 pytestmark = pytest.mark.slow  # each reproduces a paper; `make demo` does, too
@@ -293,7 +294,7 @@ def test_figures_are_pictures(paper):
         assert len(data) > SMALLEST_FIGURE, name
 
 
-@killed_by("report/experiments.py", "if pathlib.PurePath(name).name == name]", "if False]", case="slip-lmi")
+@killed_by("output.report.experiments", "if pathlib.PurePath(name).name == name]", "if False]", case="slip-lmi")
 def test_a_report_has_every_number_and_figure(paper):
     """And stands for itself: figures are in it, notes and verdicts are as they were written."""
     page = Page(build_report(find_documents(paper.folder)))

@@ -13,12 +13,12 @@ from mutants import killed_by
 from project import ROOT
 
 from diffabs import FixedStep, roads
-from diffabs.design.parameter_box import polytope
 from diffabs.linear.slip_model import SlipModel
 from diffabs.papers import arm_equations, estimator_claims, lmi_claims, lmi_design, slip_estimator, slip_lmi
-from diffabs.plants import ArmBalance, BrakeStart, MirroredRig
-from diffabs.plants.arm_balance import ArmState
-from diffabs.roads import peak
+from diffabs.parts.plants import ArmBalance, BrakeStart, MirroredRig
+from diffabs.parts.plants.arm_balance import ArmState
+from diffabs.parts.roads import peak
+from diffabs.robust.design.parameter_box import polytope
 
 PAGE = ROOT / "docs" / "papers.md"
 CAR = slip_estimator.CARS["spline B"]
@@ -34,7 +34,7 @@ def runs():
 
 
 @killed_by(
-    "papers/estimator_claims.py",
+    "papers.estimator_claims",
     'np.sum(np.abs(np.diff(run_columns(run)["torque"])))',
     'np.sum(np.maximum(np.diff(run_columns(run)["torque"]), 0))',
 )
@@ -233,7 +233,7 @@ def test_a_cost_that_is_small_for_any_mass(rig):
         assert np.isfinite(lmi_claims.cost(A, B, gain, weights)) == stable
 
 
-@killed_by("papers/lmi_claims.py", "-(Q + K.T @ K)", "-Q")
+@killed_by("papers.lmi_claims", "-(Q + K.T @ K)", "-Q")
 def test_the_nearest_explanation_of_the_gain(rig):
     """The optimum at 5 km/h alone with the published k1 has k2 = -50.3, and more for any weight on the slip error, any
     cross weight and any greater speed; -48 is that of 4.54 km/h. So the design saw the slow end of its range only: at
@@ -312,7 +312,7 @@ def test_equations_4_and_6_lack_gravity():
 
 
 @pytest.mark.slow
-@killed_by("papers/arm_equations.py", "eighth - m2 * lg * sin2", "eighth - m2 * l * lg * sin2")
+@killed_by("papers.arm_equations", "eighth - m2 * lg * sin2", "eighth - m2 * l * lg * sin2")
 def test_the_printed_equations_miss_terms_of_their_lagrangian():
     """Eq. (8) lacks l in one term; (9) and (10) have the other sign in the centrifugal term and in gravity."""
     b2, b3, c2, c3, g = 10.0, 30.0, 7.0, 21.0, 9.81

@@ -12,17 +12,17 @@ from oracles import arm_rates
 from scipy.integrate import solve_ivp
 
 from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.engine.run import measure
+from diffabs.engine.step.runge_kutta import rk4_step
+from diffabs.engine.types import FixedStep
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import transmission_zeros
 from diffabs.linear.regulator import lqr
 from diffabs.linear.slip_model import Sampling
-from diffabs.objectives import PeakArmAngle, PeakVoltage
-from diffabs.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
-from diffabs.plants.arm_balance import ArmState
+from diffabs.parts.objectives import PeakArmAngle, PeakVoltage
+from diffabs.parts.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
+from diffabs.parts.plants.arm_balance import ArmState
 from diffabs.scenario.defaults import balancing
-from diffabs.simulate.run import measure
-from diffabs.simulate.step.runge_kutta import rk4_step
-from diffabs.simulate.types import FixedStep
 
 ARM, HANGING = ArmBalance(), ArmBalance(arm_length=-0.5)
 POINT = ArmState(0.5, 0.3, 0.2, 0.1, -0.4, 0.7)
@@ -124,7 +124,7 @@ def lagrangian(p, q, rates):
 
 
 @killed_by(
-    "plants/arm_balance.py",
+    "parts.plants.arm_balance",
     "r2 = torque - c2 * sin2 * v1**2 + arm",
     "r2 = torque - c2 * sin2 * v1**2 - arm",
     case="upright",
@@ -148,7 +148,7 @@ def test_the_closed_form_is_lagranges_equation(plant):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * float(np.max(np.abs(expected))))
 
 
-@killed_by("plants/arm_balance.py", "c2 * sin2 * v2 * (2 * v1 + v2)", "c2 * sin2 * v2 * (v1 + v2)", case="hanging")
+@killed_by("parts.plants.arm_balance", "c2 * sin2 * v2 * (2 * v1 + v2)", "c2 * sin2 * v2 * (v1 + v2)", case="hanging")
 @pytest.mark.parametrize("plant", [ARM, HANGING, GEARED], ids=["upright", "hanging", "geared"])
 def test_motor_and_damper_power_is_the_change_of_energy(plant):
     """Here as tau psi' - d phi'^2, with the torque of eq. (11) by hand, relative to the largest term."""
@@ -169,7 +169,7 @@ def test_motor_and_damper_power_is_the_change_of_energy(plant):
 
 
 @killed_by(
-    "plants/arm_balance.py",
+    "parts.plants.arm_balance",
     "current = clamp(current, -self.current_max, self.current_max)",
     "current = clamp(current, -np.inf, np.inf)",
 )
@@ -192,7 +192,7 @@ def test_float32_is_as_good_as_its_digits():
     np.testing.assert_allclose(np.array(rounded) / scale, exact / scale, rtol=0, atol=100 * 2.0**-24)
 
 
-@killed_by("plants/arm_balance.py", "self.rider_mass > 0 and not", "not")
+@killed_by("parts.plants.arm_balance", "self.rider_mass > 0 and not", "not")
 def test_a_rider_without_mass_needs_no_spring():
     assert list(ACROBOT.cautions()) == []
 
@@ -209,7 +209,7 @@ def gravity_matrix(plant):
 
 
 @killed_by(
-    "plants/printed_arm.py",
+    "parts.plants.printed_arm",
     "m.gravity * b2 * (theta - psi), m.gravity * b3 * (theta - phi)",
     "m.gravity * b2 * (theta + psi), m.gravity * b3 * (theta + phi)",
 )
@@ -295,8 +295,8 @@ def test_the_zero_that_nearly_cancels_the_unstable_pole():
     assert np.max(found.real) == pytest.approx(np.sqrt(98.1 / 13.7), rel=1e-10)
 
 
-@killed_by("linear/recoverable.py", "a @ complement - np.outer", "a @ complement + np.outer")
-@killed_by("linear/recoverable.py", "> ROUNDING * size * np.linalg.norm(b)", "> 0.0 * size")
+@killed_by("linear.recoverable", "a @ complement - np.outer", "a @ complement + np.outer")
+@killed_by("linear.recoverable", "> ROUNDING * size * np.linalg.norm(b)", "> 0.0 * size")
 def test_a_slow_zero_is_found_in_any_basis():
     """(s + 1e-6)/((s + 1)(s + 2)(s + 3)(s + 4)) in random coordinates of the state: the relative degree is 3."""
     a, b, c = np.eye(4, k=1), np.eye(4)[:, 3:], np.array([1e-6, 1.0, 0.0, 0.0])

@@ -11,18 +11,18 @@ from balancing import EFFORT, HANGING, MULTIPLES, START, WEIGHTS, closed, model
 from mutants import killed_by
 from scipy.integrate import solve_ivp
 
-from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
-from diffabs.controllers.balance import ObserverMemory
 from diffabs.core.protocols import BalanceOutput, Clock, Memory, Tracking
 from diffabs.core.pytree import replace
 from diffabs.core.validity import check_part, find_problems
+from diffabs.engine.run import measure
+from diffabs.engine.types import FixedStep
 from diffabs.linear.gaussian import SELECTION, kalman, lqg
 from diffabs.linear.recoverable import mode_bounds, recoverable_bound
-from diffabs.objectives import FinalNorm
-from diffabs.plants import ArmBalance
-from diffabs.sensors import AngleSensor
-from diffabs.simulate.run import measure
-from diffabs.simulate.types import FixedStep
+from diffabs.parts.controllers import BalanceFeedback, ObserverFeedback, Sampled
+from diffabs.parts.controllers.balance import ObserverMemory
+from diffabs.parts.objectives import FinalNorm
+from diffabs.parts.plants import ArmBalance
+from diffabs.parts.sensors import AngleSensor
 
 SOLVER, MEASURED = FixedStep(step=1e-3, duration=10.0), {"final_norm": FinalNorm()}
 
@@ -38,7 +38,7 @@ def by_eigenvectors(a, b, start, limit):
 
 
 @pytest.mark.slow
-@killed_by("linear/recoverable.py", "return 2 * limit / jnp.sqrt", "return limit / jnp.sqrt")
+@killed_by("linear.recoverable", "return 2 * limit / jnp.sqrt", "return limit / jnp.sqrt")
 def test_the_bound_is_that_of_the_unstable_mode():
     a, b = (np.asarray(x) for x in model(HANGING))
     expected = by_eigenvectors(a, b, START, 48.0)
@@ -77,7 +77,7 @@ def test_two_unstable_poles_are_two_bounds():
     assert mode_bounds(a, b, np.zeros(6), 48.0) == dict.fromkeys(found, np.inf)
 
 
-@killed_by("linear/recoverable.py", "np.linalg.norm(offset - along * moved) > ROUNDING", "0.0 > ROUNDING")
+@killed_by("linear.recoverable", "np.linalg.norm(offset - along * moved) > ROUNDING", "0.0 > ROUNDING")
 def test_equal_poles_have_the_least_bound():
     """No control reaches the first state; in the second order it is the last one."""
     for b in ([[0.0], [1.0]], [[1.0], [0.0]]):
@@ -110,7 +110,7 @@ def observer():
 
 
 @pytest.mark.slow
-@killed_by("linear/gaussian.py", "dare(A.T, C.T, W, V)", "dare(A.T, C.T, 0.5 * W, V)")
+@killed_by("linear.gaussian", "dare(A.T, C.T, W, V)", "dare(A.T, C.T, 0.5 * W, V)")
 def test_kalman_is_scipys():
     random = np.random.default_rng(6)
     a, c, root = random.normal(size=(6, 6)), random.normal(size=(2, 6)), random.normal(size=(6, 6))
@@ -137,7 +137,7 @@ def corrected(observer, last, x, k=1):
 
 @pytest.mark.slow
 @killed_by(
-    "linear/gaussian.py", "jnp.linalg.solve(spread, C @ riccati.P).T", "jnp.linalg.solve(spread, C @ riccati.P @ A.T).T"
+    "linear.gaussian", "jnp.linalg.solve(spread, C @ riccati.P).T", "jnp.linalg.solve(spread, C @ riccati.P @ A.T).T"
 )
 def test_regulator_and_filter_are_those_of_the_weights():
     """SciPy's, of unknown accelerations that are constant over a period of 20 ms; other weights than the defaults."""
@@ -180,7 +180,7 @@ def test_poles_of_the_loop_are_those_of_regulator_and_filter(observer):
 
 @pytest.mark.slow
 @killed_by(
-    "controllers/balance.py",
+    "parts.controllers.balance",
     "voltage = clamp(estimate.voltage, -self.predicted_high, self.predicted_high)",
     "voltage = estimate.voltage",
 )
@@ -195,7 +195,7 @@ def test_an_observer_knows_the_limit_of_its_voltage(observer):
 
 @pytest.mark.slow
 @killed_by(
-    "controllers/balance.py",
+    "parts.controllers.balance",
     "jnp.where(number > 0, predicted + self.correction @ error, self.start(signal).held.state)",
     "predicted + self.correction @ error",
 )

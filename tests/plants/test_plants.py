@@ -10,13 +10,13 @@ from mutants import killed_by
 from parts import PLANTS
 
 from diffabs import FixedStep, braking, check, rollout
-from diffabs.controllers import ConstantTorque
 from diffabs.core.protocols import BrakeOutput
 from diffabs.core.validity import check_part
-from diffabs.objectives import BRAKING
-from diffabs.plants import GRAVITY, BrakeStart, LabRig, MirroredRig, QuarterCar, RoadVehicle
-from diffabs.plants.lab_rig import LabRigState
-from diffabs.roads import (
+from diffabs.parts.controllers import ConstantTorque
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.plants import GRAVITY, BrakeStart, LabRig, MirroredRig, QuarterCar, RoadVehicle
+from diffabs.parts.plants.lab_rig import LabRigState
+from diffabs.parts.roads import (
     DRY_ASPHALT,
     RIG,
     SNOW,
@@ -27,7 +27,7 @@ from diffabs.roads import (
     RationalCurve,
     Tabulated,
 )
-from diffabs.stops import NoStop, SpeedReached
+from diffabs.parts.stops import NoStop, SpeedReached
 
 NO_FRICTION = Burckhardt(c1=0.0, c3=0.0)
 MU = 0.39575220833898  # of the rig's curve at slip 0.2
@@ -127,7 +127,7 @@ def test_slip_in_driving_and_at_standstill():
         np.testing.assert_allclose(car.output(state).slip, slip, rtol=1e-13, atol=1e-15)
 
 
-@killed_by("plants/wheel.py", "else self.crawl_speed", "else 10.0")
+@killed_by("parts.plants.wheel", "else self.crawl_speed", "else 10.0")
 def test_without_a_stop_the_crawl_speed_limits_the_step():
     """A run may last to standstill, and below the crawl speed c the slip fades as exp(-(g k/c) (1 + m r^2/J) t). RK4 is
     stable to 2.785 of this rate, k is the friction's first slope."""
@@ -159,7 +159,7 @@ def test_lab_rig_static_load():
 
 
 @killed_by(
-    "plants/lab_rig.py",
+    "parts.plants.lab_rig",
     "normal = jnp.where(free, quotient(self.weight_torque + torque, jnp",
     "normal = jnp.where(free, quotient(self.weight_torque, jnp",
 )
@@ -185,7 +185,7 @@ def test_the_brake_of_the_lab_rig_does_not_drive(command):
     np.testing.assert_allclose(rate.brake, 20.37 * (max(15.24 * command - 14.0, 0.0) - 0.5), rtol=1e-12)
 
 
-@killed_by("plants/lab_rig.py", "yield stays_below(friction, limit,", "yield stays_below(friction, 1e9 * limit,")
+@killed_by("parts.plants.lab_rig", "yield stays_below(friction, limit,", "yield stays_below(friction, 1e9 * limit,")
 def test_a_lever_that_locks_itself_is_refused():
     """tan 65.61 deg = 2.205: at that friction no finite normal force balances the lever."""
     assert check(LabRig(road=Burckhardt(c1=2.2, c3=0.0))).road.c1 == 2.2
@@ -196,7 +196,7 @@ def test_a_lever_that_locks_itself_is_refused():
         check(LabRig(road=Burckhardt(c1=1e300)))
 
 
-@killed_by("core/validity.py", "has_fault |= bool(within)", "has_fault |= False")
+@killed_by("core.validity", "has_fault |= bool(within)", "has_fault |= False")
 def test_a_lever_on_a_broken_road_is_not_asked_for():
     """Rules between parts are for parts that are sound: this spline has fewer frictions than slips."""
     broken = Tabulated(slip=np.array([0.0, 0.1, 0.2, 1.0]), mu=np.array([0.0, 0.5, 0.6]))
@@ -205,7 +205,7 @@ def test_a_lever_on_a_broken_road_is_not_asked_for():
 
 
 @killed_by(
-    "plants/lab_rig.py",
+    "parts.plants.lab_rig",
     "jnp.where(free, arm, 1.0)), jnp.inf)",
     "jnp.where(free, arm, 1.0)), quotient(self.weight_torque + torque, arm))",
 )
@@ -218,7 +218,7 @@ def test_a_lever_that_locks_itself_further_on_is_no_run():
     assert np.isfinite(rig.derivative(0.0, ahead._replace(distance=1.0), 0.9).drum)
 
 
-@killed_by("plants/lab_rig.py", "larger(arm - grip, 0.0)", "arm - grip")
+@killed_by("parts.plants.lab_rig", "larger(arm - grip, 0.0)", "arm - grip")
 @pytest.mark.parametrize("mu", [0.4, 1.0, 1.4])
 def test_no_command_holds_a_lab_wheel_that_no_torque_holds(mu):
     """Both wheels' torque balances are linear in torque and normal force; slip is kept if omega1' = ratio omega2'."""
@@ -235,8 +235,8 @@ def test_no_command_holds_a_lab_wheel_that_no_torque_holds(mu):
     np.testing.assert_allclose(rig.holding(output(slip, speed), slip), command if normal > 0 else np.inf, rtol=1e-9)
 
 
-@killed_by("plants/lab_rig.py", "target = jnp.where(u < self.brake_threshold, 0.0, brake)", "target = brake")
-@killed_by("plants/lab_rig.py", "larger(0.0, self.brake_gain", "larger(-1e9, self.brake_gain")
+@killed_by("parts.plants.lab_rig", "target = jnp.where(u < self.brake_threshold, 0.0, brake)", "target = brake")
+@killed_by("parts.plants.lab_rig", "larger(0.0, self.brake_gain", "larger(-1e9, self.brake_gain")
 def test_the_lab_brake_by_hand():
     """Below its threshold and its offset it releases; a command of NaN brakes with NaN, and the run has diverged."""
     state = LabRigState(100.0, 140.0, 2.0, 0.0)
@@ -248,7 +248,7 @@ def test_the_lab_brake_by_hand():
         np.testing.assert_allclose(rate, 20.37 * (target - 2.0), rtol=1e-12)
 
 
-@killed_by("plants/lab_rig.py", "held = arm > self.wheel_radius * mu", "held = arm > -jnp.inf")
+@killed_by("parts.plants.lab_rig", "held = arm > self.wheel_radius * mu", "held = arm > -jnp.inf")
 def test_a_lab_wheel_that_no_torque_holds_turns_again():
     """Friction between 1.34 and tan phi: the road's torque grows faster than the brake's, whatever the brake does."""
     rig = LabRig(road=Burckhardt(c1=1.6, c3=0.0, c4=0.0))
@@ -272,7 +272,7 @@ def test_stuck_lab_wheel_carries_what_the_road_asks():
     np.testing.assert_allclose(normal, (19.6181 + torque) / arm, rtol=1e-12, atol=0)
 
 
-@killed_by("plants/lab_rig.py", "wheel = jnp.where(rests, 0.0, wheel)", "wheel = jnp.where(rests, wheel, wheel)")
+@killed_by("parts.plants.lab_rig", "wheel = jnp.where(rests, 0.0, wheel)", "wheel = jnp.where(rests, wheel, wheel)")
 def test_a_stuck_lab_wheel_stays_at_rest():
     """Exactly, on a thousand roads: a rate of 1e-16, the rounding of a torque that balances another, would turn it,
     and a wheel that turns feels all of the brake."""
@@ -295,7 +295,7 @@ def states(plant, count=60):
 
 
 @killed_by(
-    "plants/wheel.py",
+    "parts.plants.wheel",
     "return quotient(speed - wheel_speed,",
     "return quotient(wheel_speed - speed,",
     case="quarter car",
@@ -339,7 +339,7 @@ def held_slip_rate(plant, speed, target):
 
 
 @killed_by(
-    "plants/quarter_car.py",
+    "parts.plants.quarter_car",
     "self.mass * self.radius + (1 - target) * self.inertia / self.radius",
     "self.mass * self.radius",
     case="25.0-0.2-quarter car",
@@ -353,7 +353,7 @@ def test_holding_holds_the_slip(name, speed, target):
 
 
 @killed_by(
-    "plants/wheel.py",
+    "parts.plants.wheel",
     "return jnp.where(jnp.greater(speed, 0), rate, larger(rate, 0.0))",
     "return rate",
     case="mirrored rig",
@@ -387,8 +387,8 @@ def test_a_stopped_wheel_stays_stopped_until_released(name):
     assert 0 < wheel_rate(0.999 * asked) < 0.01 * released
 
 
-@killed_by("plants/wheel.py", "jnp.where(jnp.greater(speed, STANDSTILL_SPEED), speed, 0.0)", "speed", case="plant0")
-@killed_by("plants/wheel.py", "jnp.greater(speed, STANDSTILL_SPEED)", "jnp.greater(speed, 0)", case="plant0")
+@killed_by("parts.plants.wheel", "jnp.where(jnp.greater(speed, STANDSTILL_SPEED), speed, 0.0)", "speed", case="plant0")
+@killed_by("parts.plants.wheel", "jnp.greater(speed, STANDSTILL_SPEED)", "jnp.greater(speed, 0)", case="plant0")
 @pytest.mark.parametrize("plant", [QuarterCar(road=SNOW), MirroredRig(road=DRY_ASPHALT), LabRig()])
 def test_projection(plant):
     """Speeds below zero, and those that rounding leaves at standstill, become zero, the rest stays."""
@@ -411,8 +411,8 @@ def test_load_does_not_change_a_cars_deceleration():
 
 
 @pytest.mark.slow
-@killed_by("plants/road_vehicle.py", "self.drag * v * v + self.rolling", "self.drag * v + self.rolling")
-@killed_by("plants/road_vehicle.py", "return self.wheel_load * self.road", "return self.mass * GRAVITY * self.road")
+@killed_by("parts.plants.road_vehicle", "self.drag * v * v + self.rolling", "self.drag * v + self.rolling")
+@killed_by("parts.plants.road_vehicle", "return self.wheel_load * self.road", "return self.mass * GRAVITY * self.road")
 def test_a_locked_road_vehicle_stops_in_closed_form():
     """v' = -(a + c v^2/m) with a = (Fz mu + f m g)/m: time and distance from 30 to 3 m/s."""
     ice = Tabulated(slip=(0.0, 0.1, 0.5, 1.0), mu=(0.0, 0.3, 0.3, 0.3))

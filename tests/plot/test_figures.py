@@ -8,12 +8,12 @@ import pytest
 from marks import readable_id
 from mutants import killed_by
 
-from diffabs import plot
-from diffabs.controllers import HoldingInput, StateFeedback
 from diffabs.linear import band, margins, open_loop
-from diffabs.plants import MirroredRig
-from diffabs.plot.frequency import loop_shape
-from diffabs.references import FixedSlip
+from diffabs.output import plot
+from diffabs.output.plot.frequency import loop_shape
+from diffabs.parts.controllers import HoldingInput, StateFeedback
+from diffabs.parts.plants import MirroredRig
+from diffabs.parts.references import FixedSlip
 from diffabs.scenario.defaults import braking
 
 
@@ -27,7 +27,7 @@ def boxes(axis):
     return np.array([text.get_window_extent().get_points() for text in seen])
 
 
-@killed_by("plot/style.py", "scale_axis.set_minor_formatter(NullFormatter())", "pass", case="0.2, 0.9")
+@killed_by("output.plot.style", "scale_axis.set_minor_formatter(NullFormatter())", "pass", case="0.2, 0.9")
 @pytest.mark.parametrize(
     "ends", [(0.2, 0.9), (0.05, 4.0), (3e-7, 2e-6), (1e-5, 1e-3), (1e-9, 1e3), (2e4, 3e7)], ids=readable_id
 )
@@ -44,8 +44,8 @@ def test_labels_of_a_logarithmic_axis_do_not_touch(ends):
         assert (found[order][1:, 0, i] > found[order][:-1, 1, i]).all()
 
 
-@killed_by("plot/style.py", "few = low > 0 and", "few = low > 0 or")
-@killed_by("plot/style.py", "{mantissa:g}", "{mantissa:.0f}")
+@killed_by("output.plot.style", "few = low > 0 and", "few = low > 0 or")
+@killed_by("output.plot.style", "{mantissa:g}", "{mantissa:.0f}")
 def test_a_long_axis_has_powers_and_a_short_one_numbers():
     _, (ax,) = plot.sheet()
     plot.make_logarithmic(ax, "x")
@@ -61,7 +61,7 @@ def test_a_long_axis_has_powers_and_a_short_one_numbers():
 
 
 @pytest.mark.slow
-@killed_by("plot/frequency.py", "(1 / (1 + main), COLOURS[1]", "(main / (1 + main), COLOURS[1]")
+@killed_by("output.plot.frequency", "(1 / (1 + main), COLOURS[1]", "(main / (1 + main), COLOURS[1]")
 def test_the_curves_of_a_loop_are_its_response():
     loop = braking(plant=MirroredRig(), reference=FixedSlip(), feedforward=HoldingInput(), controller=StateFeedback())
     opened, others = open_loop(loop), band(loop, {"plant.mass": (5.0, 6.5)}, samples=2)

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.collections import PatchCollection
 from mutants import killed_by
 
-from diffabs.plot.proofs import ProofMap, draw_proof
+from diffabs.output.plot.proofs import ProofMap, draw_proof
 
 CELLS = np.array([[[0, 1], [0, 1]], [[1, 2], [0, 1]], [[0, 2], [1, 1.5]]], float)
 LEFT, REFUTING = np.array([[[0, 1], [1.5, 2]]], float), np.array([[1, 2], [1.5, 2]], float)
@@ -31,8 +31,10 @@ def rectangles(collection: PatchCollection) -> np.ndarray:
     )
 
 
-@killed_by("plot/proofs.py", "proved.set_array(shown.bounds[bounded])", "proved.set_array(np.arange(bounded.sum()))")
-@killed_by("plot/proofs.py", "bounded = np.isfinite(shown.bounds)", "bounded = np.isfinite(shown.bounds) | True")
+@killed_by(
+    "output.plot.proofs", "proved.set_array(shown.bounds[bounded])", "proved.set_array(np.arange(bounded.sum()))"
+)
+@killed_by("output.plot.proofs", "bounded = np.isfinite(shown.bounds)", "bounded = np.isfinite(shown.bounds) | True")
 def test_two_parameters_are_a_map_of_rectangles() -> None:
     figure = draw_proof(MAP)
     ax, bar = figure.axes

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from mutants import killed_by
 
-from diffabs import plot
 from diffabs.core.protocols import BalanceOutput, BrakeOutput, Sample
-from diffabs.plot import tuning
-from diffabs.simulate.types import Run, Trajectory
+from diffabs.engine.types import Run, Trajectory
+from diffabs.output import plot
+from diffabs.output.plot import tuning
 
 T = np.linspace(0.0, 1.5, 11)
 
@@ -19,7 +19,7 @@ def trajectory(shows=BrakeOutput):
     return Trajectory(sample, sample.output, None, np.arange(11) < 10)
 
 
-@killed_by("plot/runs.py", '(diverged)".lstrip() if run.diverged', '(diverged)".lstrip() if False')
+@killed_by("output.plot.runs", '(diverged)".lstrip() if run.diverged', '(diverged)".lstrip() if False')
 @pytest.mark.parametrize(
     ("draw", "shows"),
     [(plot.draw_braking, BrakeOutput), (plot.draw_balance, BalanceOutput), (plot.draw_signals, BrakeOutput)],
@@ -51,15 +51,15 @@ MANY = {
 }
 
 
-@killed_by("plot/style.py", "COLOURS[i % 7], ", "COLOURS[i], ", case="slips")
-@killed_by("plot/style.py", "DASHES[(i + i // 7) % 7]", "DASHES[i % 7]", case="convergence")
+@killed_by("output.plot.style", "COLOURS[i % 7], ", "COLOURS[i], ", case="slips")
+@killed_by("output.plot.style", "DASHES[(i + i // 7) % 7]", "DASHES[i % 7]", case="convergence")
 @pytest.mark.parametrize("name", MANY)
 def test_nine_curves_are_drawn_and_differ(name):
     drawn = [line for ax in MANY[name]().axes for line in ax.get_lines() if line.get_label().startswith("run ")]
     assert len({(line.get_color(), line.get_linestyle()) for line in drawn}) == len(NAMES)
 
 
-@killed_by("plot/tuning.py", "color=COLOURS[i % 7], markersize=5", "color=COLOURS[i], markersize=5")
+@killed_by("output.plot.tuning", "color=COLOURS[i % 7], markersize=5", "color=COLOURS[i], markersize=5")
 def test_nine_fronts_are_drawn():
     ax = tuning.draw_pareto(dict.fromkeys(NAMES, ([1.0, 2.0], [2.0, 1.0]))).axes[0]
     assert [text.get_text() for text in ax.get_legend().get_texts()] == NAMES

@@ -11,14 +11,14 @@ from scipy.stats import beta
 from seams import replace_seam
 from sweeping import manifest
 
-from diffabs.plot import sweeps as plots
+from diffabs.engine.types import FixedStep
+from diffabs.output.plot import sweeps as plots
 from diffabs.scenario.defaults import balancing
-from diffabs.simulate.types import FixedStep
-from diffabs.sweep import Results, Space, Study, Uniform
-from diffabs.sweep.manifest import Seals
-from diffabs.sweep.seal import encode_chunk as chunk
-from diffabs.sweep.statistics.summary import summarise_sweep
-from diffabs.sweep.store import Store
+from diffabs.uncertainty.sweep import Results, Space, Study, Uniform
+from diffabs.uncertainty.sweep.manifest import Seals
+from diffabs.uncertainty.sweep.seal import encode_chunk as chunk
+from diffabs.uncertainty.sweep.statistics.summary import summarise_sweep
+from diffabs.uncertainty.sweep.store import Store
 
 N = 1200
 A, B, C = np.random.default_rng(5).random((3, N))
@@ -103,7 +103,7 @@ def test_a_bound_far_from_the_data_does_not_press_them_together(made):
     assert "bound 30" in lines(far)
 
 
-@killed_by("plot/sweeps.py", "ax.plot(x, counts / n,", "ax.plot(x, 1 - counts / n,")
+@killed_by("output.plot.sweeps", "ax.plot(x, counts / n,", "ax.plot(x, 1 - counts / n,")
 def test_exceedance_is_one_minus_the_empirical_distribution(found):
     figure = plots.draw_exceedance(found, UNITS, confidence=0.9)
     ax, values = panels(figure)["overshoot"], OVERSHOOT[~DIVERGED]
@@ -118,7 +118,7 @@ def test_exceedance_is_one_minus_the_empirical_distribution(found):
     assert lines(ax)["bound 0.3"][0, 0] == 0.3
 
 
-@killed_by("plot/sweeps.py", "Count(int(k), n)", "Count(int(n - k), n)")
+@killed_by("output.plot.sweeps", "Count(int(k), n)", "Count(int(n - k), n)")
 def test_the_band_is_that_of_clopper_and_pearson(found):
     ax, n = panels(plots.draw_exceedance(found, confidence=0.9))["overshoot"], N - 3
     x, share = lines(ax)["runs"]
@@ -148,7 +148,7 @@ def test_of_a_saltelli_design_the_rows_a_are_drawn(made):
     assert counts.sum() == N / 4
 
 
-@killed_by("plot/sweeps.py", 'results.column("sample")[good]\n', "np.arange(np.sum(good))\n")
+@killed_by("output.plot.sweeps", 'results.column("sample")[good]\n', "np.arange(np.sum(good))\n")
 def test_the_worst_are_marked_and_named(found):
     figure = plots.draw_worst(found, UNITS, count=6)
     ax = figure.axes[0]
@@ -190,8 +190,8 @@ def test_of_many_runs_some_are_drawn_and_the_worst_of_all(made):
     assert {text.get_text().split(":")[0] for text in ax.texts} == {"17", "39000"}
 
 
-@killed_by("plot/sweeps.py", " + view.never(metric, view.good)", "")
-@killed_by("plot/sweep_view.py", "np.sum(rows & ~self.known_rows(name, rows))", "np.sum(self.rows & ~rows)")
+@killed_by("output.plot.sweeps", " + view.never(metric, view.good)", "")
+@killed_by("output.plot.sweep_view", "np.sum(rows & ~self.known_rows(name, rows))", "np.sum(self.rows & ~rows)")
 @pytest.mark.parametrize("design", ["random", "saltelli"])
 def test_the_worst_runs_that_never_settle_are_counted(made, design):
     """They are the worst of all, and have no place on the scale of colours."""
@@ -234,8 +234,8 @@ def test_rank_correlations_have_bars_and_intervals(made):
     assert drawn == [[[-0.9, centres[0]], [-0.7, centres[0]]], [[-0.1, centres[1]], [0.3, centres[1]]]]
 
 
-@killed_by("plot/sweeps.py", "default=0) * view.period", "default=0)", case="saltelli-2,700")
-@killed_by("plot/sweeps.py", 'kinds[-1]]["samples"] for', "kinds[-1]] and 1200 for", case="random-900")
+@killed_by("output.plot.sweeps", "default=0) * view.period", "default=0)", case="saltelli-2,700")
+@killed_by("output.plot.sweeps", 'kinds[-1]]["samples"] for', "kinds[-1]] and 1200 for", case="random-900")
 @pytest.mark.parametrize(("design", "runs"), [("random", "900"), ("saltelli", "2,700")])
 def test_the_title_counts_the_runs_behind_the_bars(made, design, runs):
     """Correlations may be of fewer runs than there are; an index is of groups of a variable's three runs."""
@@ -282,7 +282,7 @@ def mesh(ax):
     return (corners[0, :, 0], corners[:, 0, 1]), np.ma.filled(drawn.get_array().astype(float), np.nan).T
 
 
-@killed_by("plot/sweeps.py", "lanes == 0, table).T, **colours", "lanes == 0, table), **colours")
+@killed_by("output.plot.sweeps", "lanes == 0, table).T, **colours", "lanes == 0, table), **colours")
 def test_the_map_has_the_share_of_failed_runs(found):
     figure = plots.draw_failure_map(found, UNITS)
     ax = figure.axes[0]
@@ -295,7 +295,7 @@ def test_the_map_has_the_share_of_failed_runs(found):
     assert figure.get_suptitle() == f"rig: {failed.sum()} failed of 1,200 runs (3 diverged)"
 
 
-@killed_by("sweep/study.py", '"diverged": column("diverged"),', '"diverged": ~run,')
+@killed_by("uncertainty.sweep.study", '"diverged": column("diverged"),', '"diverged": ~run,')
 @pytest.mark.parametrize("kind", ["diverged", "stopped", "locked", "bound"])
 def test_each_kind_of_failure_is_in_the_map(made, kind):
     bad = A > 0.7
@@ -325,7 +325,7 @@ def test_cells_without_a_run_are_empty(made):
     assert table[4, 1] == table[5, 0] == 1
 
 
-@killed_by("plot/sweeps.py", "(lanes > 0) & ~np.isfinite(table)", "(lanes < 0) & ~np.isfinite(table)", case="some")
+@killed_by("output.plot.sweeps", "(lanes > 0) & ~np.isfinite(table)", "(lanes < 0) & ~np.isfinite(table)", case="some")
 @pytest.mark.parametrize("cells", ["some", "all"])
 def test_cells_of_runs_that_never_settle_have_a_colour(made, cells):
     """On a triangle of levels, so that other cells have no run and stay grey."""
@@ -345,7 +345,7 @@ def test_cells_of_runs_that_never_settle_have_a_colour(made, cells):
     assert own == ({(5, 2)} if cells == "some" else set(colours))
 
 
-@killed_by("plot/sweeps.py", "np.maximum.at(greatest, cell, values)", "greatest[:] = values.max()")
+@killed_by("output.plot.sweeps", "np.maximum.at(greatest, cell, values)", "greatest[:] = values.max()")
 def test_a_map_without_failures_shows_the_strongest_inputs(found, made):
     metrics = {"overshoot": OVERSHOOT, "effort": 5 + A}
     sweep = made({"a": A, "b": B, "c": C}, metrics, failures={"overshoot": 9.0})

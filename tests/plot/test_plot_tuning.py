@@ -5,8 +5,8 @@ import pytest
 from mutants import killed_by
 
 from diffabs.core.protocols import BrakeOutput, Sample
-from diffabs.plot import tuning as plots
-from diffabs.simulate.types import Trajectory
+from diffabs.engine.types import Trajectory
+from diffabs.output.plot import tuning as plots
 from diffabs.tune import DescentPoint
 
 HISTORY = [DescentPoint(i, 10.0 ** (1 - i), 1.0, 10.0**-i, max(0.0, 0.2 - 0.1 * i), 2 * i + 1) for i in range(5)]
@@ -63,7 +63,7 @@ def test_runs_are_shown_until_they_have_settled():
         assert ax.get_xlim()[1] == pytest.approx(1.5 * np.log(50) / 10, abs=0.02)
 
 
-@killed_by("plot/tuning.py", "        if y[i] < lowest:", "        if True:")
+@killed_by("output.plot.tuning", "        if y[i] < lowest:", "        if True:")
 def test_a_front_has_the_points_that_no_other_beats():
     x, y = np.random.default_rng(2).random((2, 60)).round(2)
     x[5] = np.nan

@@ -15,9 +15,9 @@ from seams import replace_seam
 
 import diffabs as d
 from diffabs.core.types import JsonObject
-from diffabs.reach.certificate import FORMAT
-from diffabs.reach.equations import Equations, RealOperation
-from diffabs.reach.verification import FileVerdict, verify_box
+from diffabs.robust.reach.certificate import FORMAT
+from diffabs.robust.reach.equations import Equations, RealOperation
+from diffabs.robust.reach.verification import FileVerdict, verify_box
 
 pytest.importorskip("flint")
 LOOP = d.braking()  # stands for the loop of the scenario; `equations` takes its place
@@ -84,7 +84,7 @@ def objection(document: JsonObject) -> str:
 
 
 @killed_by(
-    "reach/verification.py", "return (order * CELL_HALVINGS)[:CELL_HALVINGS]", "return order[:1] * CELL_HALVINGS"
+    "robust.reach.verification", "return (order * CELL_HALVINGS)[:CELL_HALVINGS]", "return order[:1] * CELL_HALVINGS"
 )
 def test_the_honest_file_is_verified() -> None:
     found = judge(HONEST)
@@ -144,25 +144,36 @@ EDITS: dict[str, Callable[[JsonObject], object]] = {
 }  # fmt: skip
 
 
-@killed_by("reach/verification.py", " or not math.isfinite(number)", "", case="a claim that is not a number")
-@killed_by("reach/verification.py", "isinstance(number, bool) or ", "", case="a bound that is a truth")
-@killed_by("reach/verification.py", 'name.partition(" ")[2]', "name.split()[1]", case="a bound of a signal and more")
+@killed_by("robust.reach.verification", " or not math.isfinite(number)", "", case="a claim that is not a number")
+@killed_by("robust.reach.verification", "isinstance(number, bool) or ", "", case="a bound that is a truth")
 @killed_by(
-    "reach/verification.py",
+    "robust.reach.verification", 'name.partition(" ")[2]', "name.split()[1]", case="a bound of a signal and more"
+)
+@killed_by(
+    "robust.reach.verification",
     "proved_high <= high",
     "proved_high <= high + 1e-3 * abs(high)",
     case="a bound slightly too low",
 )
-@killed_by("reach/verification.py", "proved_low >= low", "proved_low >= low * 0.999", case="a bound slightly too high")
 @killed_by(
-    "reach/verification.py", "if end is not None and not proved:", "if False:", case="a bound that no checker proves"
+    "robust.reach.verification", "proved_low >= low", "proved_low >= low * 0.999", case="a bound slightly too high"
 )
-@killed_by("reach/verification.py", "if file.horizon != horizon:", "if False:", case="a shorter horizon")
-@killed_by("reach/verification.py", "    if not file.statements:", "    if False:", case="all bounds and claims gone")
-@killed_by("reach/verification.py", "worst > claim.bound)", "False)", case="a claim beyond its bound")
-@killed_by("reach/verification.py", "if worst is None or", "if worst is not None and", case="a claim without its bound")
 @killed_by(
-    "reach/verification.py",
+    "robust.reach.verification",
+    "if end is not None and not proved:",
+    "if False:",
+    case="a bound that no checker proves",
+)
+@killed_by("robust.reach.verification", "if file.horizon != horizon:", "if False:", case="a shorter horizon")
+@killed_by(
+    "robust.reach.verification", "    if not file.statements:", "    if False:", case="all bounds and claims gone"
+)
+@killed_by("robust.reach.verification", "worst > claim.bound)", "False)", case="a claim beyond its bound")
+@killed_by(
+    "robust.reach.verification", "if worst is None or", "if worst is not None and", case="a claim without its bound"
+)
+@killed_by(
+    "robust.reach.verification",
     "if not comes_from_halving(list(file.over.values()), file.cells):",
     "if False:",
     case="a cell is missing",
@@ -175,14 +186,14 @@ def test_an_edited_file_is_noticed(name: str) -> None:
     assert objection(document)
 
 
-@killed_by("reach/cover.py", "if not -LARGEST_INPUT < low <= high < LARGEST_INPUT:", "if False:")
+@killed_by("robust.reach.cover", "if not -LARGEST_INPUT < low <= high < LARGEST_INPUT:", "if False:")
 def test_an_inverted_box_is_named() -> None:
     document = copy.deepcopy(HONEST)
     EDITS["an inverted box"](document)
     assert "over.p = [1, 0.5]; two numbers below 1e+150 are needed, the lower first" in objection(document)
 
 
-@killed_by("reach/cover.py", " and list(map(list, inside[0])) == part", "")
+@killed_by("robust.reach.cover", " and list(map(list, inside[0])) == part", "")
 def test_a_hole_among_many_cells_is_noticed_at_once() -> None:
     """The halvings of 16^3 cells have 34,650 orders."""
     document = copy.deepcopy(HONEST)
@@ -200,7 +211,7 @@ def test_a_share_of_the_cells_is_in_its_range(share: float) -> None:
         judge(HONEST, share)
 
 
-@killed_by("reach/verification.py", "[*holding, *sample]", "sample")
+@killed_by("robust.reach.verification", "[*holding, *sample]", "sample")
 def test_the_cell_of_a_suspect_is_always_checked() -> None:
     """A bound that is false in one of 16 cells is noticed, whatever cells the sample has."""
     document = copy.deepcopy(HONEST)

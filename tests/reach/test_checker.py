@@ -12,11 +12,11 @@ from mutants import killed_by
 from seams import replace_seam
 
 import diffabs as d
-from diffabs.reach.equations import Equations, RealOperation, _Derivation, derive_equations
+from diffabs.robust.reach.equations import Equations, RealOperation, _Derivation, derive_equations
 from diffabs.scenario.scenario import load
 
 flint = pytest.importorskip("flint")
-checker = pytest.importorskip("diffabs.reach.checker")
+checker = pytest.importorskip("diffabs.robust.reach.checker")
 arb, check_cell, NotProved = flint.arb, checker.check_cell, checker.NotProved
 
 LMI = ("slip-lmi", ["controller.low=0", "controller.high=9.03"])
@@ -106,9 +106,9 @@ def within(inner, outer):
     return outer[0] <= min(inner) and max(inner) <= outer[1]
 
 
-@killed_by("reach/checker.py", "for y in (a, b, *inside)]", "for y in (a, b)]")
-@killed_by("reach/checker.py", "return near + 0.0 if arb(near) >= high else nextafter(near, inf)", "return near")
-@killed_by("reach/checker.py", "return arb(value, float(np.spacing(abs(value))))", "return arb(value)")
+@killed_by("robust.reach.checker", "for y in (a, b, *inside)]", "for y in (a, b)]")
+@killed_by("robust.reach.checker", "return near + 0.0 if arb(near) >= high else nextafter(near, inf)", "return near")
+@killed_by("robust.reach.checker", "return arb(value, float(np.spacing(abs(value))))", "return arb(value)")
 def test_the_balls_contain_the_intervals():
     """Sums of ends are compared in fractions; a limit lies within its chord; signs are kept."""
     draw = random.Random(1)
@@ -152,8 +152,8 @@ def assert_encloses(bounds, truths, width):
     assert max(truths) <= high <= max(truths) + width
 
 
-@killed_by("reach/checker.py", "return series.value(rate, order - 1) / order", "return ZERO")
-@killed_by("reach/checker.py", "sums.append((q, middle + extra, along,", "sums.append((q, middle, along,")
+@killed_by("robust.reach.checker", "return series.value(rate, order - 1) / order", "return ZERO")
+@killed_by("robust.reach.checker", "sums.append((q, middle + extra, along,", "sums.append((q, middle, along,")
 @pytest.mark.parametrize(("cell", "width"), [((1.0, 1.0), 1e-10), ((0.9, 1.1), 1e-10)])
 def test_an_oscillator_is_enclosed(cell, width):
     w, until = 3.0, 1.25
@@ -165,8 +165,8 @@ def test_an_oscillator_is_enclosed(cell, width):
     assert -3 * cell[1] >= bounds.lower["v"] >= -3 * cell[1] - 3e-3
 
 
-@killed_by("reach/checker.py", "return _dot(x, y, 0, k, k)", "return _dot(x, y, 0, 0, k)")
-@killed_by("reach/checker.py", "(inverse - alpha) * margin.whole", "ZERO")
+@killed_by("robust.reach.checker", "return _dot(x, y, 0, k, k)", "return _dot(x, y, 0, 0, k)")
+@killed_by("robust.reach.checker", "(inverse - alpha) * margin.whole", "ZERO")
 @pytest.mark.parametrize(("cell", "width"), [((0.1, 0.1), 1e-6), ((0.1, 0.101), 1e-4)])
 def test_a_logistic_equation_is_enclosed(cell, width):
     r, until = 2.0, 0.9
@@ -177,10 +177,10 @@ def test_a_logistic_equation_is_enclosed(cell, width):
     assert bounds.lower["x"] <= cell[0]
 
 
-@killed_by("reach/checker.py", "return [_symmetric(x) for x in moved], slack", "return [ZERO] * n, slack")
-@killed_by("reach/checker.py", "y = y + _along(*self.seeds[i])", "pass")
+@killed_by("robust.reach.checker", "return [_symmetric(x) for x in moved], slack", "return [ZERO] * n, slack")
+@killed_by("robust.reach.checker", "y = y + _along(*self.seeds[i])", "pass")
 @killed_by(
-    "reach/checker.py", "if all(b.contains(m) for b, m in zip(box, moved, strict=True)) and all(", "if True or all("
+    "robust.reach.checker", "if all(b.contains(m) for b, m in zip(box, moved, strict=True)) and all(", "if True or all("
 )
 @pytest.mark.parametrize(("cell", "width"), [((0.5, 0.5), 1e-5), ((0.5, 0.51), 1e-3)])
 def test_a_limit_within_a_flow_is_enclosed(cell, width):
@@ -240,11 +240,11 @@ def test_a_lost_disturbance_shows(monkeypatch):
     assert not low <= 1 + math.log(2.0) <= high
 
 
-@killed_by("reach/checker.py", "self.stays_nonnegative(box, chords)", "pass")
-@killed_by("reach/checker.py", "states |= set(e.nonnegative)", "pass")
-@killed_by("reach/checker.py", "if value(a).contains(0):", "if False:")
-@killed_by("reach/checker.py", "not box[s].upper() < FASTEST_SLIP:", "False:")
-@killed_by("reach/checker.py", "not box[self.speed].lower() > float(SLOWEST):", "False:")
+@killed_by("robust.reach.checker", "self.stays_nonnegative(box, chords)", "pass")
+@killed_by("robust.reach.checker", "states |= set(e.nonnegative)", "pass")
+@killed_by("robust.reach.checker", "if value(a).contains(0):", "if False:")
+@killed_by("robust.reach.checker", "not box[s].upper() < FASTEST_SLIP:", "False:")
+@killed_by("robust.reach.checker", "not box[self.speed].lower() > float(SLOWEST):", "False:")
 def test_what_has_no_proof_is_refused():
     t = Tape()
     p, zero, one = t("param", value=0), t.number(0.0), t.number(1.0)
@@ -283,7 +283,7 @@ def test_what_has_no_proof_is_refused():
         check_cell(chain, ("x",), [(0.5, 0.6)], [0.1], 10.0)
 
 
-@killed_by("reach/checker.py", "x.nonnegative_part() if low >= 0 else x", "x")
+@killed_by("robust.reach.checker", "x.nonnegative_part() if low >= 0 else x", "x")
 def test_a_state_that_may_not_be_negative_may_be_zero():
     """x' = 1 from x(0) = p until x = 0.5; half of 0.1 has more digits than the radius of a ball."""
     t = Tape()
@@ -301,8 +301,8 @@ def test_a_horizon_ends_the_proof_early():
     assert bounds.distance[0] == pytest.approx(math.sin(3 * bounds.stop_time[0]) / 3, abs=1e-9)
 
 
-@killed_by("reach/checker.py", "y += j * u[j] * g[k - j]", "pass")
-@killed_by("reach/checker.py", "return _power(x, value(o.args[2]))", "return _power(x.mid(), value(o.args[2]))")
+@killed_by("robust.reach.checker", "y += j * u[j] * g[k - j]", "pass")
+@killed_by("robust.reach.checker", "return _power(x, value(o.args[2]))", "return _power(x.mid(), value(o.args[2]))")
 @pytest.mark.parametrize("name", ["exp", "log", "sin", "atan", "power", "inv"])
 @pytest.mark.parametrize(("cell", "width"), [((0.5, 0.5), 1e-7), ((0.5, 0.54), 3e-2)])
 def test_functions_are_enclosed(name, cell, width):
@@ -357,15 +357,20 @@ RISING = {  # a function f, c and x of about the same slopes c and f'(x): a wron
 
 
 @killed_by(
-    "reach/checker.py",
+    "robust.reach.checker",
     "return -self._convolve(o.args[0], self._sq",
     "return self._convolve(o.args[0], self._sq",
     case="inv",
 )
-@killed_by("reach/equations.py", 'RealOperation("neg", (at,))', 'RealOperation("add", (at, at))', case="cos")
-@killed_by("reach/equations.py", '(self.number(1.0), self.make("mul", (u, u)))', "(self.number(9.0), u)", case="atan")
+@killed_by("robust.reach.equations", 'RealOperation("neg", (at,))', 'RealOperation("add", (at, at))', case="cos")
 @killed_by(
-    "reach/equations.py", 'RealOperation("mul", (exponent, at + 2))', 'RealOperation("const", (), -0.3)', case="power"
+    "robust.reach.equations", '(self.number(1.0), self.make("mul", (u, u)))', "(self.number(9.0), u)", case="atan"
+)
+@killed_by(
+    "robust.reach.equations",
+    'RealOperation("mul", (exponent, at + 2))',
+    'RealOperation("const", (), -0.3)',
+    case="power",
 )
 @pytest.mark.parametrize("name", RISING)
 def test_a_function_has_its_own_derivative(name):
@@ -390,8 +395,8 @@ def test_a_function_has_its_own_derivative(name):
     assert_encloses(check_cell(e, ("x",), [cell], [0.25], 10.0).distance, [c * y + function(y) for y in cell], 0.1)
 
 
-@killed_by("reach/checker.py", "h * slack.get(q.rate, ZERO)))", "ZERO))", case="y")
-@killed_by("reach/checker.py", "(b[i] + sum((M[i][j] * D[j] for j in range(n)), ZERO))", "b[i]", case="z")
+@killed_by("robust.reach.checker", "h * slack.get(q.rate, ZERO)))", "ZERO))", case="y")
+@killed_by("robust.reach.checker", "(b[i] + sum((M[i][j] * D[j] for j in range(n)), ZERO))", "b[i]", case="z")
 @pytest.mark.parametrize("rate", ["y", "z"])
 def test_a_disturbance_reaches_what_it_moves(rate):
     """x' = 0, y' = max(x, 0), z' = 50 y, and the distance is that of y or z, in one step of 0.1 s."""
@@ -404,7 +409,7 @@ def test_a_disturbance_reaches_what_it_moves(rate):
     assert_encloses(distance, [0.0, {"y": 0.5 * 0.1**2, "z": 50 * 0.1**3 / 6}[rate]], 0.05)
 
 
-@killed_by("reach/checker.py", "+ remainder * t**order + slack", "+ slack")
+@killed_by("robust.reach.checker", "+ remainder * t**order + slack", "+ slack")
 def test_a_signal_has_the_remainder_of_its_polynomial():
     """The second order of a step of 1e-3 s is 5e-6; the run ends 1e-6 s before step 100 does."""
     until = 0.1 - 1e-6
@@ -427,7 +432,7 @@ def growth(until):
 
 
 @killed_by(
-    "reach/checker.py", "near if self.rates is None else {x: _hull(near[x], self.rates[x]) for x in near}", "near"
+    "robust.reach.checker", "near if self.rates is None else {x: _hull(near[x], self.rates[x]) for x in near}", "near"
 )
 def test_the_rates_of_all_ends_count():
     """The slowest run of a wide cell ends at a lower rate than the others, which have gone on, have then."""
@@ -436,14 +441,14 @@ def test_the_rates_of_all_ends_count():
     assert_encloses(bounds.stop_time, [math.log(2 / p) for p in cell], 0.3)
 
 
-@killed_by("reach/checker.py", "return self.rates is None and self.time()", "return self.time()")
+@killed_by("robust.reach.checker", "return self.rates is None and self.time()", "return self.time()")
 def test_a_horizon_between_two_ends_is_no_end():
     bounds = check_cell(growth(2.0), ("x",), [(0.8, 1.2)], [0.01], 0.7)
     assert bounds.stop_time[0] <= math.log(2 / 1.2)
     assert math.log(2 / 0.8) <= bounds.stop_time[1] < math.inf
 
 
-@killed_by("reach/checker.py", "return whole.upper() < 0\n", "return whole.mid() < 0\n")
+@killed_by("robust.reach.checker", "return whole.upper() < 0\n", "return whole.mid() < 0\n")
 def test_a_proof_goes_on_until_the_last_run_ends():
     """x' = t - 1.5, x(0) = p; the run ends at x = 0.5. Later runs end at lower rates."""
     t = Tape()
@@ -530,7 +535,7 @@ def cell_at(mass, speed, mass_side, speed_side):
 
 def proved_by_engine(equations, cell, horizon):
     """Bounds of the native prover, or None if it has no proof."""
-    engine = pytest.importorskip("diffabs.reach.engine")
+    engine = pytest.importorskip("diffabs.robust.reach.engine")
     prover = engine.Prover(equations, ("slip",), horizon, tolerance=1e-8)
     prover.choose_weights(np.mean(cell, axis=1))
     found = prover.prove(np.array([cell] * 8), 1)
@@ -569,7 +574,7 @@ def test_the_cured_gain():
 
 
 @killed_by(
-    "reach/checker.py",
+    "robust.reach.checker",
     "return _Chord(ONE, ZERO, arb(0.5), values, values)",
     "return _Chord(ONE, ZERO, ZERO, values, values)",
 )

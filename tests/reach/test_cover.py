@@ -12,11 +12,11 @@ from mutants import killed_by
 from scipy.integrate import solve_ivp
 
 import diffabs as d
-from diffabs.objectives import Overshoot, StopDistance, StopTime
-from diffabs.reach import NoRule, RunClaim, prove_box
-from diffabs.reach.cover import _cut_to_size, comes_from_halving
-from diffabs.reach.engine import FAILURES, Prover
-from diffabs.reach.equations import Equations, RealOperation, derive_equations
+from diffabs.parts.objectives import Overshoot, StopDistance, StopTime
+from diffabs.robust.reach import NoRule, RunClaim, prove_box
+from diffabs.robust.reach.cover import _cut_to_size, comes_from_halving
+from diffabs.robust.reach.engine import FAILURES, Prover
+from diffabs.robust.reach.equations import Equations, RealOperation, derive_equations
 from diffabs.scenario.scenario import load
 
 pytestmark = pytest.mark.usefixtures("native_prover")
@@ -40,12 +40,12 @@ def oscillator(period: float | None = None) -> Equations:
 
 
 @killed_by(
-    "reach/native/prove.cpp",
+    "robust/reach/native/prove.cpp",
     "remainder[i] = rest.value(state_op[i], order + 1) * power;",
     "remainder[i] = I(0.0) * power;",
 )
 @killed_by(
-    "reach/native/prove.cpp",
+    "robust/reach/native/prove.cpp",
     "for (int k = order; k-- > 0;) sum = sum * H + mid.value(a, k);",
     "for (int k = order - 1; k-- > 0;) sum = sum * H + mid.value(a, k);",
 )
@@ -66,8 +66,8 @@ def test_oscillator_against_its_closed_form() -> None:
     assert -1.0 <= found.below[0, 1] < -1.0 + 1e-2
 
 
-@killed_by("reach/native/series.h", "y[j] = -slope(a, k)[j]; return;", "y[j] = slope(a, k)[j]; return;")
-@killed_by("reach/native/prove.cpp", "fine ? -bottom[s][lane] : -INFINITY", "fine ? top[s][lane] : -INFINITY")
+@killed_by("robust/reach/native/series.h", "y[j] = -slope(a, k)[j]; return;", "y[j] = slope(a, k)[j]; return;")
+@killed_by("robust/reach/native/prove.cpp", "fine ? -bottom[s][lane] : -INFINITY", "fine ? top[s][lane] : -INFINITY")
 def test_a_wide_oscillator_against_its_closed_form() -> None:
     found = Prover(oscillator(), ("x", "v"), 3.0).prove(np.array([[[0.5, 1.5]]]), 1)
     assert found.status[0] == 2
@@ -134,8 +134,10 @@ def test_published_gain_within_its_limits() -> None:
 
 
 @pytest.mark.slow
-@killed_by("reach/native/prove.cpp", "rate.mid() * (inverse_rate.mid()", "0.0 * (inverse_rate.mid()")
-@killed_by("reach/native/prove.cpp", "end.caused(end.way_G, end.speed, p)", "end.caused(end.time_G, end.speed, p)")
+@killed_by("robust/reach/native/prove.cpp", "rate.mid() * (inverse_rate.mid()", "0.0 * (inverse_rate.mid()")
+@killed_by(
+    "robust/reach/native/prove.cpp", "end.caused(end.way_G, end.speed, p)", "end.caused(end.time_G, end.speed, p)"
+)
 def test_the_sides_of_a_cell_widen_time_and_distance_as_in_runs() -> None:
     prover = Prover(derive_equations(load("slip-lmi", LIMITED).loop, list(SMALL)), ("slip",), 2.0)
     prover.choose_weights(np.array([5.3, 6.0]))
@@ -146,7 +148,7 @@ def test_the_sides_of_a_cell_widen_time_and_distance_as_in_runs() -> None:
 
 
 @pytest.mark.slow
-@killed_by("reach/native/prove.cpp", "if (q < 0) return;", "if (q < n) return;")
+@killed_by("robust/reach/native/prove.cpp", "if (q < 0) return;", "if (q < n) return;")
 def test_a_distance_that_is_a_signal_has_its_bounds() -> None:
     prover = Prover(derive_equations(load("slip-lmi", LIMITED).loop, list(SMALL)), ("slip", "distance"), 2.0)
     prover.choose_weights(np.array([5.3, 6.0]))
@@ -202,7 +204,7 @@ def test_without_time_nothing_is_decided() -> None:
     assert proof.bounds["stop_time"] == (-math.inf, math.inf)
 
 
-@killed_by("reach/cover.py", "    _check_claims(claims, equations.signals)\n", "", case="largest slip")
+@killed_by("robust.reach.cover", "    _check_claims(claims, equations.signals)\n", "", case="largest slip")
 @pytest.mark.parametrize("quantity", ["overshoot", "largest slip", "greatest slop", "greatest slip speed"])
 def test_a_claim_about_no_quantity_is_refused(quantity: str) -> None:
     message = f"claims: '{quantity}' is no quantity of this loop; there is stop_time, stop_distance, and .* slip, speed"
@@ -210,8 +212,8 @@ def test_a_claim_about_no_quantity_is_refused(quantity: str) -> None:
         prove_box(load("slip-lmi", LIMITED).loop, SMALL, [RunClaim(quantity, 0.34)], horizon=2.0)
 
 
-@killed_by("reach/cover.py", "if not 0 < value < math.inf:", "if False:", case="a horizon before the start")
-@killed_by("reach/cover.py", "if not math.isfinite(claim.bound):", "if False:", case="a claim without a bound")
+@killed_by("robust.reach.cover", "if not 0 < value < math.inf:", "if False:", case="a horizon before the start")
+@killed_by("robust.reach.cover", "if not math.isfinite(claim.bound):", "if False:", case="a claim without a bound")
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -245,7 +247,7 @@ def test_a_setting_that_does_not_exist_is_refused() -> None:
         Prover(oscillator(), ("x",), 2.0, **wrong)
 
 
-@killed_by("reach/cover.py", "FEWEST * np.spacing(np.abs(box).max(1))", "0.0")
+@killed_by("robust.reach.cover", "FEWEST * np.spacing(np.abs(box).max(1))", "0.0")
 def test_a_side_of_two_floats_is_not_halved() -> None:
     """A run that stops too late keeps the proof refining; there is no float between two neighbours."""
     box = {"plant.mass": (float(np.nextafter(5.5, 0.0)), float(np.nextafter(5.5, 6.0)))}
@@ -254,8 +256,8 @@ def test_a_side_of_two_floats_is_not_halved() -> None:
     assert proof.cells.tolist() == [[list(*box.values())]]
 
 
-@killed_by("reach/cover.py", "_widths(cells) * influence, 0.0)", "_widths(cells) * influence, _widths(cells))")
-@killed_by("reach/cover.py", " & (matters > 0).any(1)", "")
+@killed_by("robust.reach.cover", "_widths(cells) * influence, 0.0)", "_widths(cells) * influence, _widths(cells))")
+@killed_by("robust.reach.cover", " & (matters > 0).any(1)", "")
 def test_a_short_side_is_not_halved_untried() -> None:
     """The first side has the length of two floats, and matters most; the second is halved until it is too short."""
     box = np.array([[1.0, np.nextafter(1.0, 2.0)], [0.0, 1.0]])
@@ -277,7 +279,7 @@ def test_many_halvings_of_many_sides_are_found() -> None:
     assert not comes_from_halving(box, [*cells[:-1], left])
 
 
-@killed_by("reach/cover.py", "again = now[~satisfied]\n", "again = now[~satisfied][1:]\n")
+@killed_by("robust.reach.cover", "again = now[~satisfied]\n", "again = now[~satisfied][1:]\n")
 def test_cells_cover_the_box() -> None:
     worst = max(rig_run(m, v)[0] for m in SMALL["plant.mass"] for v in SMALL["initial.speed"])
     proof = prove_box(
@@ -317,7 +319,7 @@ def test_random_runs_lie_within_their_cells(name: str, changes: list[str], claim
             assert ends[0] - 1e-6 <= runs.metrics[column][i] <= ends[1] + 1e-6
 
 
-@killed_by("reach/cover.py", "if beyond > RUN_ERROR * abs(run):", "if False:")
+@killed_by("robust.reach.cover", "if beyond > RUN_ERROR * abs(run):", "if False:")
 def test_a_run_beyond_a_proved_bound_makes_the_proof_undecided() -> None:
     """Either the proof or the run is wrong; a stop after 20 s is."""
     loop, claims = load("slip-lmi", LIMITED).loop, [RunClaim("greatest slip", 0.9)]
@@ -363,13 +365,16 @@ BASIC = (("param", (), 0), ("state", (), 0), ("state", (), 1), ("const", (), 0.0
 
 
 @killed_by(
-    "reach/native/prove.cpp",
+    "robust/reach/native/prove.cpp",
     "r.delta = (linear | above | under) ? zero : vmax(gaps.h - middle, gaps.n + middle);",
     "r.delta = zero;",
 )
-@killed_by("reach/native/prove.cpp", "push[i] = push[i] + Y[i] * symmetric(delta) * HH;", "push[i] = I(0.0);")
+@killed_by("robust/reach/native/prove.cpp", "push[i] = push[i] + Y[i] * symmetric(delta) * HH;", "push[i] = I(0.0);")
 @killed_by(
-    "reach/native/prove.cpp", "I(NEVER) : s.value(c, 0); }", "I(NEVER) : scaled(s.value(c, 0), 0.99); }", case="short"
+    "robust/reach/native/prove.cpp",
+    "I(NEVER) : s.value(c, 0); }",
+    "I(NEVER) : scaled(s.value(c, 0), 0.99); }",
+    case="short",
 )
 @pytest.mark.parametrize(("step", "width"), [(0.3, 0.2), (1e-3, 2e-3)], ids=["long", "short"])
 def test_a_step_across_a_limit_is_enclosed(step: float, width: float) -> None:
@@ -382,8 +387,8 @@ def test_a_step_across_a_limit_is_enclosed(step: float, width: float) -> None:
     assert found.time[0, 1] - found.time[0, 0] < width
 
 
-@killed_by("reach/native/prove.cpp", "{&mid, &rest, &whole, &box,", "{&mid, &whole, &box,")
-@killed_by("reach/native/prove.cpp", "out[1] = stopped ? -T.n[lane] : 0", "out[1] = stopped ? T.h[lane] : 0")
+@killed_by("robust/reach/native/prove.cpp", "{&mid, &rest, &whole, &box,", "{&mid, &whole, &box,")
+@killed_by("robust/reach/native/prove.cpp", "out[1] = stopped ? -T.n[lane] : 0", "out[1] = stopped ? T.h[lane] : 0")
 def test_a_parameter_of_the_flow_is_enclosed() -> None:
     """x' = -p x from x(0) = 1 by steps of low order: x = 1/2 at t = log 2/p."""
     operations = tape(*BASIC, ("mul", (0, 1)), ("neg", (5,)), ("const", (), 0.5), ("sub", (1, 7)))
@@ -394,7 +399,7 @@ def test_a_parameter_of_the_flow_is_enclosed() -> None:
     assert 0 < found.time[0, 1] - found.time[0, 0] < 0.05
 
 
-@killed_by("reach/native/prove.cpp", "ok &= upper ? there[i].h <= 0 : there[i].n <= 0;", "ok &= mask(true);")
+@killed_by("robust/reach/native/prove.cpp", "ok &= upper ? there[i].h <= 0 : there[i].n <= 0;", "ok &= mask(true);")
 def test_growth_that_is_faster_than_a_step() -> None:
     """x' = 60 x: a box whose faces point outward holds nothing, so the step must be shorter than 1/60 s."""
     operations = tape(*BASIC, ("const", (), 60.0), ("mul", (5, 1)))
@@ -423,7 +428,7 @@ def test_a_lag_that_is_shorter_than_a_period() -> None:
     assert 1.0 <= found.upper[0, 0] < 1.05
 
 
-@killed_by("reach/native/series.h", "y + symmetric(fill(0.5))", "y")
+@killed_by("robust/reach/native/series.h", "y + symmetric(fill(0.5))", "y")
 def test_a_rounding_at_a_tick_is_enclosed() -> None:
     """x := x/2 + round(4 x)/16 every second, from x(0) = p: some run of the cell is near each end of the bounds."""
     operations = tape(
@@ -445,9 +450,12 @@ def test_a_rounding_at_a_tick_is_enclosed() -> None:
     assert found.upper[0, 0] < np.max(after) + 0.1
 
 
-@killed_by("reach/native/prove.cpp", "x = fill(-INFINITY);", "x = fill(-NEVER);", case="rounding")
+@killed_by("robust/reach/native/prove.cpp", "x = fill(-INFINITY);", "x = fill(-NEVER);", case="rounding")
 @killed_by(
-    "reach/native/prove.cpp", "symmetric(fill(INFINITY)), both)", "symmetric(fill(NEVER)), both)", case="no value"
+    "robust/reach/native/prove.cpp",
+    "symmetric(fill(INFINITY)), both)",
+    "symmetric(fill(NEVER)), both)",
+    case="no value",
 )
 @pytest.mark.parametrize("name", ["rounding", "no value"])
 def test_what_is_not_proved_has_infinite_bounds(name: str) -> None:
@@ -466,7 +474,7 @@ def test_what_is_not_proved_has_infinite_bounds(name: str) -> None:
         assert (found.lower[0, 1], found.upper[0, 1]) == (-math.inf, math.inf)
 
 
-@killed_by("reach/engine.py", "live |= set(e.nonnegative)", "pass")
+@killed_by("robust.reach.engine", "live |= set(e.nonnegative)", "pass")
 def test_a_state_that_may_not_be_negative_is_always_followed() -> None:
     """x' = -1 from x(0) = p until t = 1/2: nothing reads x, which becomes negative at t = p."""
     operations = tape(*BASIC, ("neg", (4,)), ("const", (), 0.5), ("sub", (6, 2)))

@@ -17,16 +17,16 @@ import diffabs as d
 from diffabs.core.protocols import BrakeOutput
 from diffabs.core.pytree import param, pytree, static
 from diffabs.core.types import PyTree, Scalar
-from diffabs.plants import BrakeStart, QuarterCar
-from diffabs.reach import NoRule
-from diffabs.reach.engine import Prover
-from diffabs.reach.equations import Equations, derive_equations
-from diffabs.references import Setpoint
+from diffabs.parts.plants import BrakeStart, QuarterCar
+from diffabs.parts.references import Setpoint
+from diffabs.parts.stops import NoStop
+from diffabs.robust.reach import NoRule
+from diffabs.robust.reach.engine import Prover
+from diffabs.robust.reach.equations import Equations, derive_equations
 from diffabs.scenario.scenario import load
-from diffabs.stops import NoStop
 
 
-@killed_by("reach/equations.py", "for speed in (SLOWEST, FASTEST)", "for speed in (FASTEST,)")
+@killed_by("robust.reach.equations", "for speed in (SLOWEST, FASTEST)", "for speed in (FASTEST,)")
 def test_a_plant_whose_slip_is_another_one_at_low_speed_is_refused() -> None:
     """The slip of the rig is (v - w)/max(v, w, crawl speed)."""
     assert derive_equations(load("slip-lmi").loop, ["plant.mass"]).params == ("plant.mass",)
@@ -35,7 +35,7 @@ def test_a_plant_whose_slip_is_another_one_at_low_speed_is_refused() -> None:
             derive_equations(load("slip-lmi", [f"plant.crawl_speed={crawl}"]).loop, ["plant.mass"])
 
 
-@killed_by("reach/equations.py", "check_slip_chart(self.loop, self.paths)", "check_slip_chart(self.loop)")
+@killed_by("robust.reach.equations", "check_slip_chart(self.loop, self.paths)", "check_slip_chart(self.loop)")
 def test_a_parameter_of_the_box_must_not_change_the_slip() -> None:
     radii = ["plant.wheel_radius", "plant.body_radius"]
     assert derive_equations(load("slip-lmi").loop, radii).params == tuple(radii)
@@ -44,7 +44,7 @@ def test_a_parameter_of_the_box_must_not_change_the_slip() -> None:
 
 
 @killed_by(
-    "reach/equations.py", '"delay"):\n                raise', "):\n                raise", case="controller.delay"
+    "robust.reach.equations", '"delay"):\n                raise', "):\n                raise", case="controller.delay"
 )
 @pytest.mark.parametrize("path", ["controller.period", "controller.delay"])
 def test_a_range_of_periods_or_delays_is_refused(path: str) -> None:
@@ -112,8 +112,8 @@ class MomentumQuarterCar(QuarterCar):
         return self.plain().output(self.full(state))
 
 
-@killed_by("reach/equations.py", 'op("sub", of(x), op("mul", node, of(y)))', "y", case="MomentumQuarterCar")
-@killed_by("reach/equations.py", "zip(inputs, rates, strict=True)", "zip(inputs, plant_nodes, strict=True)")
+@killed_by("robust.reach.equations", 'op("sub", of(x), op("mul", node, of(y)))', "y", case="MomentumQuarterCar")
+@killed_by("robust.reach.equations", "zip(inputs, rates, strict=True)", "zip(inputs, plant_nodes, strict=True)")
 @pytest.mark.parametrize("plant", [StoppedQuarterCar, MomentumQuarterCar])
 def test_rates_come_from_the_values_of_the_output(plant: type[QuarterCar]) -> None:
     """Not from the derivatives that a part declares, and whatever its states are."""
@@ -138,7 +138,7 @@ NUMBERED = {
 }
 
 
-@killed_by("reach/equations.py", "if not _nodes_below(root).isdisjoint(grid):", "if False:", case="a played noise")
+@killed_by("robust.reach.equations", "if not _nodes_below(root).isdisjoint(grid):", "if False:", case="a played noise")
 @pytest.mark.parametrize("name", NUMBERED)
 def test_a_block_that_counts_its_ticks_is_refused(name: str) -> None:
     """The equations have one tick for all instants."""
@@ -146,7 +146,7 @@ def test_a_block_that_counts_its_ticks_is_refused(name: str) -> None:
         derive_equations(NUMBERED[name], ["plant.mass"])
 
 
-@killed_by("reach/equations.py", "period is not None and float(period) != loop_period", "False")
+@killed_by("robust.reach.equations", "period is not None and float(period) != loop_period", "False")
 def test_an_inner_block_with_another_period_is_refused() -> None:
     inner = d.controllers.PlayedCommand(period=0.05)
     with pytest.raises(NoRule, match=r"different periods: 0\.01 s, 0\.05 s"):
@@ -210,13 +210,13 @@ def rate_of(formula: Any, x: float, **values: float) -> float | bool:
     return value_at(e, e.flow[0], [values.get("a", 1.0)], [x, 0.0, 0.0, 0.0])
 
 
-@killed_by("reach/equations.py", 'make("select", (negative, self.power(args[0], number(0.5), 0.5), no_value))',
+@killed_by("robust.reach.equations", 'make("select", (negative, self.power(args[0], number(0.5), 0.5), no_value))',
            "self.power(args[0], number(0.5), 0.5)", case="root")  # fmt: skip
-@killed_by("reach/equations.py", 'make("lt", (make("mul", (args[0], number(0.0))), number(1.0)))',
+@killed_by("robust.reach.equations", 'make("lt", (make("mul", (args[0], number(0.0))), number(1.0)))',
            'make("truth", (), True)', case="test")  # fmt: skip
-@killed_by("reach/equations.py", "else 2.0 if node.op in SMALL else np.inf", "else 2.0", case="zero")
+@killed_by("robust.reach.equations", "else 2.0 if node.op in SMALL else np.inf", "else 2.0", case="zero")
 @killed_by(
-    "reach/equations.py",
+    "robust.reach.equations",
     'case "const" if _is_finite(node):',
     'case "const" if node.attr == np.inf:\n                return 2.0\n            case "const":',
     case="times",
@@ -240,8 +240,10 @@ def test_a_number_without_a_value_has_none(formula: Any) -> None:
 
 
 @pytest.mark.usefixtures("native_prover")
-@killed_by("reach/equations.py", "math.exp(sizes[0]) if sizes[0] < MAX_EXPONENT else np.inf", "2.0", case="times exp")
-@killed_by("reach/equations.py", "return sizes[0] * sizes[1]", "return 2.0", case="times square")
+@killed_by(
+    "robust.reach.equations", "math.exp(sizes[0]) if sizes[0] < MAX_EXPONENT else np.inf", "2.0", case="times exp"
+)
+@killed_by("robust.reach.equations", "return sizes[0] * sizes[1]", "return 2.0", case="times square")
 @pytest.mark.parametrize(
     ("formula", "x"),
     [
@@ -261,12 +263,12 @@ def test_a_number_that_no_double_holds_has_no_value(formula: Any, x: float) -> N
     equations = derive_equations(loop, ["plant.a"])
     found = Prover(equations, ("position",), 1e-3).prove(np.array([[[1.0, 1.1]]]), 1)
     assert found.status[0] == 0
-    checker = pytest.importorskip("diffabs.reach.checker")
+    checker = pytest.importorskip("diffabs.robust.reach.checker")
     with pytest.raises(checker.NotProved, match="no finite value"):
         checker.check_cell(equations, ["position"], [(1.0, 1.1)], steps=[1e-3], horizon=1e-3)
 
 
-@killed_by("reach/equations.py", "return x.args[2] if is_asked else x", "return x.args[2]")
+@killed_by("robust.reach.equations", "return x.args[2] if is_asked else x", "return x.args[2]")
 def test_a_power_with_another_condition_is_no_power() -> None:
     """The form of `core.numerics.power`, whose inner condition asks something else."""
 
@@ -277,7 +279,7 @@ def test_a_power_with_another_condition_is_no_power() -> None:
     assert rate_of(gate, 0.7, a=1.0, b=3.0) == pytest.approx(0.7**3)
 
 
-@killed_by("reach/equations.py", 'np.asarray(leaf).dtype.kind == "f" and not', "False and not")
+@killed_by("robust.reach.equations", 'np.asarray(leaf).dtype.kind == "f" and not', "False and not")
 def test_numbers_of_the_loop_are_not_rounded_by_numpy() -> None:
     """In doubles a b - c is 0; exactly it is 0.18."""
     a, b, c = 94906267.3, 94906271.1, 9007199933462864.0
@@ -289,7 +291,7 @@ def test_numbers_of_the_loop_are_not_rounded_by_numpy() -> None:
     assert "sub" in names
 
 
-@killed_by("reach/equations.py", "return _is_finite(node) and Fraction(repr(float(node.attr)))",
+@killed_by("robust.reach.equations", "return _is_finite(node) and Fraction(repr(float(node.attr)))",
            "return _is_finite(node) and Fraction(float(node.attr))")  # fmt: skip
 def test_a_difference_of_two_decimals_is_not_folded() -> None:
     """0.3 - 0.2 is exact in doubles, 0.09999999999999998; the decimals have the difference 0.1."""
@@ -297,7 +299,7 @@ def test_a_difference_of_two_decimals_is_not_folded() -> None:
     assert e.operations[e.flow[0]].name == "sub"
 
 
-@killed_by("reach/equations.py", "if node.dtype not in (np.float64, np.bool_) and", "if False and")
+@killed_by("robust.reach.equations", "if node.dtype not in (np.float64, np.bool_) and", "if False and")
 def test_integers_are_refused() -> None:
     """An unsigned 0 - 1 is 255."""
     loop = odd_loop(lambda x, a, b, c: ((x > 1).astype(jnp.uint8) - jnp.uint8(1)).astype(float))

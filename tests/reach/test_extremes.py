@@ -7,13 +7,13 @@ import pytest
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.reach.extremes import ExtremeRuns, find_extreme_runs
+from diffabs.robust.reach.extremes import ExtremeRuns, find_extreme_runs
 from diffabs.scenario.scenario import load
 
 
-@killed_by("reach/extremes.py", "if n**wide <= MAX_RUNS)", "if True)", case="7-1-128")
-@killed_by("reach/extremes.py", "n > 1 and is_wide(ends)", "n > 1", case="1-1-9")
-@killed_by("reach/extremes.py", "n > 1 and is_wide(ends)", "is_wide(ends)", case="10-0-1")
+@killed_by("robust.reach.extremes", "if n**wide <= MAX_RUNS)", "if True)", case="7-1-128")
+@killed_by("robust.reach.extremes", "n > 1 and is_wide(ends)", "n > 1", case="1-1-9")
+@killed_by("robust.reach.extremes", "n > 1 and is_wide(ends)", "is_wide(ends)", case="10-0-1")
 @pytest.mark.parametrize(("wide", "pinned", "count"), [(1, 1, 9), (3, 1, 125), (4, 0, 625), (7, 1, 128), (10, 0, 1)])
 def test_few_runs_of_a_box_are_simulated(wide: int, pinned: int, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The runs are a grid of at most 1,000; a single value, also 0, has one."""
@@ -25,7 +25,7 @@ def test_few_runs_of_a_box_are_simulated(wide: int, pinned: int, count: int, mon
         assert not np.any(batch.values.get("initial.slip", 0.0))
         raise InterruptedError
 
-    monkeypatch.setattr("diffabs.reach.extremes.run_batch", count_runs)
+    monkeypatch.setattr("diffabs.robust.reach.extremes.run_batch", count_runs)
     road = (f"road.{name}" for name in ("w1", "w2", "w3", "w4", "a"))
     plant = ("mass", "wheel_radius", "body_radius", "wheel_inertia", *road)
     names = [*(f"plant.{name}" for name in plant), "initial.speed"]
@@ -36,8 +36,8 @@ def test_few_runs_of_a_box_are_simulated(wide: int, pinned: int, count: int, mon
     assert sizes == [count]
 
 
-@killed_by("reach/extremes.py", "np.nanargmax(column)", "np.nanargmin(column)")
-@killed_by("reach/extremes.py", "np.nanmin(columns[name])", "np.nanmax(columns[name])")
+@killed_by("robust.reach.extremes", "np.nanargmax(column)", "np.nanargmin(column)")
+@killed_by("robust.reach.extremes", "np.nanmin(columns[name])", "np.nanmax(columns[name])")
 def test_the_fastest_brake_needs_the_longest_way() -> None:
     """The extremes are those of single runs at the ends of the box."""
     scenario = load("slip-lmi", ["solver.duration=3"])
@@ -50,7 +50,7 @@ def test_the_fastest_brake_needs_the_longest_way() -> None:
         assert end == pytest.approx(float(distance), rel=1e-4)
 
 
-@killed_by("reach/extremes.py", "dict.fromkeys(map(tuple, self.worst.values()))", "map(tuple, self.worst.values())")
+@killed_by("robust.reach.extremes", "dict.fromkeys(map(tuple, self.worst.values()))", "map(tuple, self.worst.values())")
 def test_a_run_that_is_worst_twice_is_one_point() -> None:
     extremes = ExtremeRuns({}, {"stop_time": [6.2], "stop_distance": [6.2], "greatest slip": [5.3]})
     assert extremes.points == [[6.2], [5.3]]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from diffabs.reach.cover import RunClaim, prove_box
-from diffabs.reach.engine import FAILURES, Prover
-from diffabs.reach.equations import derive_equations
+from diffabs.robust.reach.cover import RunClaim, prove_box
+from diffabs.robust.reach.engine import FAILURES, Prover
+from diffabs.robust.reach.equations import derive_equations
 from diffabs.scenario.scenario import load
 
 pytestmark = pytest.mark.usefixtures("native_prover")

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from mutants import killed_by
 
-from diffabs.reach.engine import FAILURES, Prover
-from diffabs.reach.equations import Equations, RealOperation
+from diffabs.robust.reach.engine import FAILURES, Prover
+from diffabs.robust.reach.equations import Equations, RealOperation
 
 CELLS = np.array([[[0.3, 0.4]], [[-1.0, 2.0]]])
 SCRIPT = pathlib.Path(__file__).parents[1] / "support" / "sanitized_prover.py"
@@ -35,7 +35,7 @@ def still(period: float | None = None) -> Equations:
 
 
 @pytest.mark.usefixtures("native_prover")
-@killed_by("reach/engine.py", "if not self.persistent:", "if False:")
+@killed_by("robust.reach.engine", "if not self.persistent:", "if False:")
 @pytest.mark.parametrize("period", [None, 0.1], ids=["continuous", "sampled"])
 def test_signals_that_depend_on_no_state_are_bounded(period):
     prover = Prover(still(period), ("param", "const", "square", "inverse"), 1.0)
@@ -60,7 +60,7 @@ def test_any_signals_may_be_wanted(signals):
 
 
 @pytest.mark.usefixtures("native_prover")
-@killed_by("reach/engine.py", "stop.value = 1", "stop.value = 0")
+@killed_by("robust.reach.engine", "stop.value = 1", "stop.value = 0")
 def test_an_interrupt_ends_native_calls():
     """A run of 1e9 s under short steps would take minutes. Without the stop its threads go on after the interrupt."""
     prover = Prover(still(), ("x", "t"), 1e9, longest=1e-4, tolerance=1e-14)

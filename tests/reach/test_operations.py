@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mutants import killed_by
 
-from diffabs.reach.engine import apply_operation, decimal_ends
+from diffabs.robust.reach.engine import apply_operation, decimal_ends
 
 pytestmark = pytest.mark.usefixtures("native_prover")
 CONTEXT = decimal.Context(prec=60)
@@ -22,15 +22,18 @@ def intervals(rng: np.random.Generator, count: int, low: float = -8, high: float
 
 @pytest.mark.parametrize("count", [5_000, pytest.param(50_000, marks=pytest.mark.slow)], ids=["few", "many"])
 @pytest.mark.parametrize("name", ["add", "sub", "mul", "inv"])
-@killed_by("reach/native/prove.cpp", "double* out) {\n  Upward upward;\n  for", "double* out) {\n  for")
+@killed_by("robust/reach/native/prove.cpp", "double* out) {\n  Upward upward;\n  for", "double* out) {\n  for")
 @killed_by(
-    "reach/native/interval.h",
+    "robust/reach/native/interval.h",
     "  none |= ~fine;\n  V low = fine ? -a.n : fill(1.0)",
     "  V low = fine ? -a.n : fill(1.0)",
     case="inv-few",
 )
 @killed_by(
-    "reach/native/interval.h", "return {a.n + b.n, a.h + b.h};", "return {a.n + b.n, -(-a.h - b.h)};", case="add-few"
+    "robust/reach/native/interval.h",
+    "return {a.n + b.n, a.h + b.h};",
+    "return {a.n + b.n, -(-a.h - b.h)};",
+    case="add-few",
 )
 def test_operations_contain_the_exact_results(name: str, count: int) -> None:
     rng = np.random.default_rng(1)
@@ -94,13 +97,13 @@ def exact_value(name: str, x: float, y: float) -> decimal.Decimal:
     ],
 )
 @killed_by(
-    "reach/native/interval.h",
+    "robust/reach/native/interval.h",
     "k <= 16; k++) term = term * y * inverses()[k], sum = sum + term;\n  sum = sum + symmetric(term.mag());",
     "k <= 9; k++) term = term * y * inverses()[k], sum = sum + term;",
     case="exp--600-600",
 )
 @killed_by(
-    "reach/native/interval.h",
+    "robust/reach/native/interval.h",
     "for (int k = 1; k <= 22; k++) {",
     "for (int k = 1; k <= 6; k++) {",
     case="atan--10000.0-10000.0",

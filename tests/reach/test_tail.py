@@ -14,13 +14,13 @@ from seams import replace_seam
 
 import diffabs as d
 from diffabs.core.types import JsonObject
-from diffabs.reach.certificate import FORMAT, tail_document
-from diffabs.reach.cover import RunClaim, prove_box
-from diffabs.reach.engine import CellBounds, Prover
-from diffabs.reach.equations import Equations, RealOperation
-from diffabs.reach.search_tail import find_tail
-from diffabs.reach.tail import RunTail, stop_speed
-from diffabs.reach.verification import FileVerdict, verify_box
+from diffabs.robust.reach.certificate import FORMAT, tail_document
+from diffabs.robust.reach.cover import RunClaim, prove_box
+from diffabs.robust.reach.engine import CellBounds, Prover
+from diffabs.robust.reach.equations import Equations, RealOperation
+from diffabs.robust.reach.search_tail import find_tail
+from diffabs.robust.reach.tail import RunTail, stop_speed
+from diffabs.robust.reach.verification import FileVerdict, verify_box
 
 pytestmark = pytest.mark.usefixtures("native_prover")
 RATE, TARGET, HORIZON = 40.0, 0.2, 5.0
@@ -84,7 +84,9 @@ def tail_of(prover: Prover) -> RunTail:
     return tail
 
 
-@killed_by("reach/search_tail.py", "return tail if len(tail.pieces) > 1 else None", "return None", case="continuous")
+@killed_by(
+    "robust.reach.search_tail", "return tail if len(tail.pieces) > 1 else None", "return None", case="continuous"
+)
 @PERIODS
 def test_runs_from_a_piece_stay_in_its_ranges(period: float | None) -> None:
     tail, random = tail_of(prover_of(brake(period))), np.random.default_rng(1)
@@ -109,9 +111,14 @@ def bounds(period: float | None, cells: np.ndarray, *, settled: bool) -> CellBou
 
 
 @killed_by(
-    "reach/native/prove.cpp", "return now_.c + integral + symmetric(w);", "return now_.c + integral;", case="continuous"
+    "robust/reach/native/prove.cpp",
+    "return now_.c + integral + symmetric(w);",
+    "return now_.c + integral;",
+    case="continuous",
 )
-@killed_by("reach/native/prove.cpp", "in &= off.mag() + spread <=", "in &= 0.0 * off.mag() <=", case="continuous")
+@killed_by(
+    "robust/reach/native/prove.cpp", "in &= off.mag() + spread <=", "in &= 0.0 * off.mag() <=", case="continuous"
+)
 @PERIODS
 def test_a_cell_that_ends_in_the_tail_bounds_its_runs(period: float | None) -> None:
     """The tail makes the bounds of the stop at most 0.3 % wider."""
@@ -260,7 +267,9 @@ EDITS: dict[str, Callable[[JsonObject], object]] = {
 }  # fmt: skip
 
 
-@killed_by("reach/verification.py", "    return _find_gap(file)\n", '    return ""\n', case="a slower piece is wider")
+@killed_by(
+    "robust.reach.verification", "    return _find_gap(file)\n", '    return ""\n', case="a slower piece is wider"
+)
 @pytest.mark.parametrize("name", EDITS)
 def test_an_edited_tail_is_noticed(monkeypatch: pytest.MonkeyPatch, honest: JsonObject, name: str) -> None:
     document = copy.deepcopy(honest)
@@ -268,7 +277,7 @@ def test_an_edited_tail_is_noticed(monkeypatch: pytest.MonkeyPatch, honest: Json
     assert objection(monkeypatch, document)
 
 
-@killed_by("reach/verification.py", "or name_contradiction(bounds, extremes or {})", "")
+@killed_by("robust.reach.verification", "or name_contradiction(bounds, extremes or {})", "")
 def test_a_bound_that_a_run_violates_is_not_verified(monkeypatch: pytest.MonkeyPatch, honest: JsonObject) -> None:
     """A false piece could make it false in all cells."""
     longest = honest["bounds"]["stop_time"][1]
@@ -277,7 +286,7 @@ def test_a_bound_that_a_run_violates_is_not_verified(monkeypatch: pytest.MonkeyP
         assert bool(judge(monkeypatch, honest, known).reason) == is_beyond
 
 
-@killed_by("reach/verification.py", "if reason and tail is not None and latest is None:", "if False:")
+@killed_by("robust.reach.verification", "if reason and tail is not None and latest is None:", "if False:")
 def test_bounds_of_cells_from_before_the_tail_are_verified(monkeypatch: pytest.MonkeyPatch, honest: JsonObject) -> None:
     """The tail says less about the stop than the runs do that are followed to it."""
     document = copy.deepcopy(honest)
@@ -286,22 +295,22 @@ def test_bounds_of_cells_from_before_the_tail_are_verified(monkeypatch: pytest.M
     assert judge(monkeypatch, document).reason == ""
 
 
-@killed_by("reach/checker.py", "or e.speed in settled", "")
+@killed_by("robust.reach.checker", "or e.speed in settled", "")
 def test_the_speed_is_no_settled_state(monkeypatch: pytest.MonkeyPatch, honest: JsonObject) -> None:
     document = copy.deepcopy(honest)
     EDITS["the speed as a settled state"](document)
     assert "without its speed" in judge(monkeypatch, document).reason
 
 
-@killed_by("reach/checker.py", "<= arb(piece.width[i]):", "<= arb(1):")
+@killed_by("robust.reach.checker", "<= arb(piece.width[i]):", "<= arb(1):")
 @killed_by(
-    "reach/checker.py",
+    "robust.reach.checker",
     "y = q.centre + integral + _symmetric(q.uncertainty)",
     "y = q.centre + _symmetric(q.uncertainty)",
 )
 @pytest.mark.parametrize("speed", [1.1, 5.5], ids=["too slow to settle", "settles"])
 def test_the_checker_bounds_runs_that_end_in_the_tail(speed: float) -> None:
-    checker = pytest.importorskip("diffabs.reach.checker")
+    checker = pytest.importorskip("diffabs.robust.reach.checker")
     tail, steps = tail_of(prover_of(brake())), [2e-3]
     cell = [(2.5, 2.55), (speed, speed + 0.02)]
     found = checker.check_cell(brake(), ["slip"], cell, steps, HORIZON, tail=tail)

@@ -13,8 +13,15 @@ from commands import assert_one_error_line, run
 from mutants import killed_by
 
 from diffabs.core.types import JsonObject
-from diffabs.reach.certificate import FORMAT
-from diffabs.reach.verification import CELL_HALVINGS, FileVerdict, _choose_sides, _map_cells, read_proof, verify_box
+from diffabs.robust.reach.certificate import FORMAT
+from diffabs.robust.reach.verification import (
+    CELL_HALVINGS,
+    FileVerdict,
+    _choose_sides,
+    _map_cells,
+    read_proof,
+    verify_box,
+)
 from diffabs.scenario.scenario import loads
 
 pytest.importorskip("flint")
@@ -88,7 +95,7 @@ def test_a_file_that_is_no_proof_is_refused(tmp_path: pathlib.Path, proof: pathl
         run("verify", broken, status=2)
 
 
-@killed_by("reach/verification.py", "if not isinstance(member, kind):", "if False:")
+@killed_by("robust.reach.verification", "if not isinstance(member, kind):", "if False:")
 @pytest.mark.parametrize(
     ("changed", "line"),
     [
@@ -107,7 +114,7 @@ def test_a_wrong_member_of_a_file_is_named(changed: JsonObject, line: str) -> No
         read_proof({**document, "bounds": {}, "horizon": 1.0, **changed})
 
 
-@killed_by("cli/prove.py", "if not isinstance(text, str):", "if False:")
+@killed_by("cli.prove", "if not isinstance(text, str):", "if False:")
 @pytest.mark.parametrize(
     ("changed", "line"),
     [
@@ -123,7 +130,7 @@ def test_a_file_without_a_scenario_is_refused_by_name(changed: JsonObject, line:
     assert line in result.stderr
 
 
-@killed_by("cli/prove.py", "if proved and not whole", "if not whole")
+@killed_by("cli.prove", "if proved and not whole", "if not whole")
 def test_a_refuted_file_has_no_hint_to_check_more(proof: pathlib.Path, tmp_path: pathlib.Path) -> None:
     document = json.loads(proof.read_text())
     shorter_duration(document)
@@ -135,7 +142,7 @@ def test_a_refuted_file_has_no_hint_to_check_more(proof: pathlib.Path, tmp_path:
     assert "proves all" not in result.stdout
 
 
-@killed_by("reach/verification.py", "why = readers[i % count].recv()", "why = ''")
+@killed_by("robust.reach.verification", "why = readers[i % count].recv()", "why = ''")
 @pytest.mark.slow
 def test_several_processes_check_every_cell(proof: pathlib.Path) -> None:
     document = json.loads(proof.read_text())
@@ -154,13 +161,13 @@ def test_several_processes_check_every_cell(proof: pathlib.Path) -> None:
     assert verdict().reason
 
 
-@killed_by("reach/verification.py", 'why = "the process that checked it has ended"', 'why = ""')
+@killed_by("robust.reach.verification", 'why = "the process that checked it has ended"', 'why = ""')
 @pytest.mark.slow
 def test_a_cell_whose_process_ends_is_not_proved() -> None:
     assert all(why for _, why in _map_cells(os._exit, [3, 3], 2))
 
 
-@killed_by("reach/verification.py", "key=lambda i: shares[i]", "key=lambda i: -shares[i]")
+@killed_by("robust.reach.verification", "key=lambda i: shares[i]", "key=lambda i: -shares[i]")
 def test_the_side_that_the_prover_halved_most_is_halved_first() -> None:
     """A side that is a point is not halved."""
     over = {"plant.mass": (5.0, 6.0), "initial.speed": (8.0, 16.0), "plant.inertia": (1.0, 1.0)}

@@ -50,7 +50,9 @@ def fed(block, signal_at, end, steps=4000):
 
 
 @killed_by(
-    "references/extremum_seeking.py", "slip * deceleration - m.covariance", "slip * signal.deceleration - m.covariance"
+    "parts.references.extremum_seeking",
+    "slip * deceleration - m.covariance",
+    "slip * signal.deceleration - m.covariance",
 )
 def test_seeking_finds_the_slope_whatever_moves_the_slip():
     """On a line a = a0 + p slip the covariance is p times the variance, so the estimate is p m/b where the resolution
@@ -67,7 +69,7 @@ def test_seeking_finds_the_slope_whatever_moves_the_slip():
 
 
 @killed_by(
-    "references/extremum_seeking.py", "self.gain * e * clamp(room / jnp.log1p(self.band), 0.0, 1.0)", "self.gain * e"
+    "parts.references.extremum_seeking", "self.gain * e * clamp(room / jnp.log1p(self.band), 0.0, 1.0)", "self.gain * e"
 )
 def test_seeking_climbs_at_its_gain_and_stays_within_its_limits():
     """A deceleration in proportion to the slip has the elasticity 1: ln s grows at the gain, until the band."""
@@ -88,7 +90,7 @@ def test_seeking_climbs_at_its_gain_and_stays_within_its_limits():
     np.testing.assert_allclose(block.output(np.pi / 60.0, down, None), 1.1 * block.setpoint(down), rtol=1e-12)
 
 
-@killed_by("references/extremum_seeking.py", "climb = self.gain * e", "climb = -self.gain * e")
+@killed_by("parts.references.extremum_seeking", "climb = self.gain * e", "climb = -self.gain * e")
 @pytest.mark.slow
 def test_seeking_ends_at_the_peak_of_a_road():
     """From either side, under a controller, on a road whose peak is known."""
@@ -108,7 +110,7 @@ def test_seeking_ends_at_the_peak_of_a_road():
 
 
 @killed_by(
-    "references/by_deceleration.py",
+    "parts.references.by_deceleration",
     "return (signal.deceleration - memory.flow) / self.time_constant",
     "return 1e3 * (signal.deceleration - memory.flow)",
 )

@@ -65,7 +65,9 @@ def ours(bias):
 
 
 @pytest.mark.slow
-@killed_by("references/peak_slip.py", "return jnp.abs(signal.deceleration)", "return signal.deceleration", case="0.1")
+@killed_by(
+    "parts.references.peak_slip", "return jnp.abs(signal.deceleration)", "return signal.deceleration", case="0.1"
+)
 @pytest.mark.parametrize("bias", [-0.2, -0.05, 0.0, 0.1, 0.2])
 def test_a_biased_accelerometer_misleads_the_latch(bias):
     """Forward biases of 0.1 m/s^2 and more: |a| falls through zero before the wheel has slipped, the latch takes that

@@ -7,7 +7,7 @@ from scipy.integrate import quad
 from scipy.stats import binomtest, chi2, norm
 from scipy.stats import t as student_t
 
-from diffabs.reliability.importance_sampling import (
+from diffabs.uncertainty.reliability.importance_sampling import (
     CountedScore,
     ImportanceEstimate,
     Mixture,
@@ -17,7 +17,7 @@ from diffabs.reliability.importance_sampling import (
     is_better_estimate,
     student_quantile,
 )
-from diffabs.reliability.subset_simulation import (
+from diffabs.uncertainty.reliability.subset_simulation import (
     SubsetReason,
     _advance_chains,
     _level_cov,
@@ -90,8 +90,8 @@ class TestKnown:
     91 % where subset simulation stays alone, as in d = 100, so at least 6 of 10 with a probability of 0.999."""
 
     @pytest.mark.slow
-    @killed_by("reliability/subset_simulation.py", "math.sqrt(1 - s**2) * z + s", "z + s")
-    @killed_by("reliability/subset_simulation.py", "accepted = new >= value", "accepted = new >= -np.inf")
+    @killed_by("uncertainty.reliability.subset_simulation", "math.sqrt(1 - s**2) * z + s", "z + s")
+    @killed_by("uncertainty.reliability.subset_simulation", "accepted = new >= value", "accepted = new >= -np.inf")
     @pytest.mark.parametrize("beta", [3.0, 4.75342, 5.19934])
     @pytest.mark.parametrize(("d", "least"), [(2, 10), (10, 10), (100, 6)])
     def test_a_half_space(self, d, least, beta):
@@ -163,7 +163,7 @@ class TestSubset:
         assert found.probability == pytest.approx(norm.sf(2.5), rel=0.4)  # 62 of 10000: three standard deviations
 
     @killed_by(
-        "reliability/subset_simulation.py",
+        "uncertainty.reliability.subset_simulation",
         "if len(level_results) > 1 and hits.any() else plain",
         "if hits.any() else plain",
     )
@@ -179,7 +179,7 @@ class TestSubset:
         assert sum(each.interval[0] <= truth <= each.interval[1] for each in found) >= 89  # of 100: 0.6 % for less
 
     @killed_by(
-        "reliability/subset_simulation.py",
+        "uncertainty.reliability.subset_simulation",
         "_product_estimate(level_results, last.family[hits]) if len(level_results) > 1 and hits.any() else plain",
         "_product_estimate(level_results, last.family) if len(level_results) > 1 else plain",
     )
@@ -204,7 +204,9 @@ class TestSubset:
             assert each.interval[0] <= norm.sf(4.5) <= each.interval[1]
 
     @killed_by(
-        "reliability/subset_simulation.py", "note if subset is plain else f", "note if subset is not None else f"
+        "uncertainty.reliability.subset_simulation",
+        "note if subset is plain else f",
+        "note if subset is not None else f",
     )
     def test_a_late_second_region_is_an_assumption_that_the_note_states(self):
         """The second region has a third of the failures but enters at a late level: the page on sweeps has figures."""
@@ -284,7 +286,7 @@ class TestSubset:
         assert len(np.unique(found.failing, axis=0)) == 100
         assert np.all(np.diff(np.sum(found.failing**2, axis=1)) >= 0)
 
-    @killed_by("reliability/subset_simulation.py", "(1 + max(0.0, excess))", "1.0")
+    @killed_by("uncertainty.reliability.subset_simulation", "(1 + max(0.0, excess))", "1.0")
     def test_covariance_of_chains(self):
         rng = np.random.default_rng(0)
         frozen = np.tile(rng.random(400) < 0.2, (10, 1))
@@ -337,7 +339,7 @@ class TestImportance:
         error = np.std(weight[:, None] * z**2, axis=0) / np.sqrt(len(z))
         assert np.all(np.abs(second - 1) <= 4 * error)
 
-    @killed_by("reliability/importance_sampling.py", "np.exp(mixture.log_weight(z)), 0.0)", "1e-6, 0.0)")
+    @killed_by("uncertainty.reliability.importance_sampling", "np.exp(mixture.log_weight(z)), 0.0)", "1e-6, 0.0)")
     def test_failures_foretell_the_variance(self):
         found = runs(linear(10), 10, B6, 20)
         foretold = np.array([each.importance.predicted_cov for each in found])
@@ -359,7 +361,7 @@ class TestImportance:
         assert Mixture(one, np.ones(1), np.ones(1)).log_weight(z).max() > np.log(1e6)
 
     @killed_by(
-        "reliability/importance_sampling.py",
+        "uncertainty.reliability.importance_sampling",
         "return below <= MAX_DEVIATIONS_APART",
         "return True or below <= MAX_DEVIATIONS_APART",
     )
@@ -390,7 +392,7 @@ def of_both_sides(z):
 
 class TestGradient:
     @killed_by(
-        "reliability/importance_sampling.py",
+        "uncertainty.reliability.importance_sampling",
         "np.sum(slope * z, axis=1) + threshold - score",
         "np.sum(slope * z, axis=1) - score",
     )

@@ -11,11 +11,11 @@ from seams import replace_seam
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, stops
-from diffabs.reliability.failure import _make_gradient, _run_scores, failure_probability
-from diffabs.reliability.importance_sampling import design_points
 from diffabs.scenario.defaults import braking
-from diffabs.sweep import Normal, Space, Study, Triangular, Uniform
-from diffabs.sweep.variables import Correlation
+from diffabs.uncertainty.reliability.failure import _make_gradient, _run_scores, failure_probability
+from diffabs.uncertainty.reliability.importance_sampling import design_points
+from diffabs.uncertainty.sweep import Normal, Space, Study, Triangular, Uniform
+from diffabs.uncertainty.sweep.variables import Correlation
 
 RIG = braking(
     plant=plants.MirroredRig(),
@@ -45,7 +45,9 @@ def test_scores_are_runs():
         assert value == pytest.approx(float(alone), rel=1e-12)
 
 
-@killed_by("reliability/failure.py", "(above - below) / (2 * DIFFERENCE_STEP)", "(above - below) / (above - below)")
+@killed_by(
+    "uncertainty.reliability.failure", "(above - below) / (2 * DIFFERENCE_STEP)", "(above - below) / (above - below)"
+)
 @pytest.mark.slow
 @pytest.mark.parametrize("metric", ["stop_distance", pytest.param("max_slip", marks=pytest.mark.slow)])
 def test_slopes_are_differences_of_runs(metric):
@@ -65,7 +67,7 @@ def test_slopes_are_differences_of_runs(metric):
         np.testing.assert_allclose(slope[:, j], difference, rtol=1e-5, atol=1e-9, err_msg=f"z_{j}")
 
 
-@killed_by("reliability/failure.py", "if gradients else None", "if False else None")
+@killed_by("uncertainty.reliability.failure", "if gradients else None", "if False else None")
 @pytest.mark.slow
 def test_gradients_lead_to_the_design_point_of_a_slippery_road():
     """Where the distance reaches the bound nearest to the mean: at w4 = 0.4 - 0.01 * 4, whatever the mass."""
@@ -90,16 +92,16 @@ def test_the_probability_of_a_slippery_road():
     assert found.probability == pytest.approx(norm.cdf(-4.0), rel=0.5)
 
 
-@killed_by("reliability/failure.py", "np.nextafter(np.asarray(bound, study.dtype), np.inf)", "bound")
-@killed_by("reliability/failure.py", "np.asarray(bound, study.dtype)", "bound", case="0.1-float32")
+@killed_by("uncertainty.reliability.failure", "np.nextafter(np.asarray(bound, study.dtype), np.inf)", "bound")
+@killed_by("uncertainty.reliability.failure", "np.asarray(bound, study.dtype)", "bound", case="0.1-float32")
 @killed_by(
-    "reliability/failure.py",
+    "uncertainty.reliability.failure",
     "np.nextafter(np.asarray(bound, study.dtype), np.inf)",
     "np.asarray(bound * (1 + 2e-7), study.dtype)",
     case="0.0-float64",
 )
 @killed_by(
-    "reliability/failure.py",
+    "uncertainty.reliability.failure",
     "np.nextafter(np.asarray(bound, study.dtype), np.inf)",
     "np.asarray(bound * (1 + 2e-7), study.dtype)",
     case="-0.1-float64",
@@ -119,9 +121,11 @@ def test_a_metric_at_its_bound_has_not_failed(bound, dtype, monkeypatch):
     assert [level.threshold for level in found.levels] == [bound]
 
 
-@killed_by("reliability/failure.py", "strict=True) if level.threshold == beyond", ") if level.threshold == beyond")
-@killed_by("reliability/failure.py", "if level.threshold == beyond", "if level.threshold >= bound")
-@killed_by("reliability/failure.py", "progress(state_bound(level))", "progress(level)")
+@killed_by(
+    "uncertainty.reliability.failure", "strict=True) if level.threshold == beyond", ") if level.threshold == beyond"
+)
+@killed_by("uncertainty.reliability.failure", "if level.threshold == beyond", "if level.threshold >= bound")
+@killed_by("uncertainty.reliability.failure", "progress(state_bound(level))", "progress(level)")
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_a_level_states_whether_its_bound_is_exceeded(dtype, monkeypatch):
     """Three tenths of the masses are at the bound or above it, and a hundredth above it: a level each."""
@@ -145,7 +149,7 @@ def test_a_level_states_whether_its_bound_is_exceeded(dtype, monkeypatch):
     ]
 
 
-@killed_by("reliability/failure.py", "np.where(accepted, score[: len(z)], -np.inf)", "score[: len(z)]")
+@killed_by("uncertainty.reliability.failure", "np.where(accepted, score[: len(z)], -np.inf)", "score[: len(z)]")
 def test_a_refused_trial_shortens_the_search(monkeypatch):
     """The tangent of tanh leads from a failure far below the speed at which a run stops: no metric means a thing."""
     bound = float(np.tanh(4 * 0.5))  # at 3.5 standard deviations
@@ -163,7 +167,7 @@ def test_a_refused_trial_shortens_the_search(monkeypatch):
     np.testing.assert_allclose(points, [[3.5]], atol=0.1)
 
 
-@killed_by("reliability/failure.py", "if not np.isfinite(beyond):", "if False:")
+@killed_by("uncertainty.reliability.failure", "if not np.isfinite(beyond):", "if False:")
 def test_what_is_not_there_is_said():
     with pytest.raises(ValueError, match="overshoot is not measured; there is max_slip, stop_distance"):
         failure_probability(STUDY, "overshoot", 0.5)

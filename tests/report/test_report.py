@@ -24,14 +24,14 @@ pytest.importorskip("matplotlib")
 from mutants import killed_by
 
 from diffabs.cli import report as reporting
-from diffabs.report import ReportError, build_report, find_documents
-from diffabs.report.charts import draw_lines
-from diffabs.report.writing import SECTION_BY_KIND
-from diffabs.sweep import Results as SweepResults
-from diffabs.sweep.manifest import Seals
-from diffabs.sweep.seal import encode_chunk
-from diffabs.sweep.statistics.summary import summarise_sweep
-from diffabs.sweep.store import Store
+from diffabs.output.report import ReportError, build_report, find_documents
+from diffabs.output.report.charts import draw_lines
+from diffabs.output.report.writing import SECTION_BY_KIND
+from diffabs.uncertainty.sweep import Results as SweepResults
+from diffabs.uncertainty.sweep.manifest import Seals
+from diffabs.uncertainty.sweep.seal import encode_chunk
+from diffabs.uncertainty.sweep.statistics.summary import summarise_sweep
+from diffabs.uncertainty.sweep.store import Store
 
 TUNED = tune_section(2, 1.0)
 HOSTILE = '<script>alert("x")</script><img src=http://x.test/a.png onerror=alert(1)>'
@@ -98,7 +98,7 @@ def leaves(value):
     return {repr(value)} if isinstance(value, int | float) and not isinstance(value, bool) else set()
 
 
-@killed_by("report/page.py", 'f"data:{kind};base64,{text}"', "path.as_uri()", case="sweep")
+@killed_by("output.report.page", 'f"data:{kind};base64,{text}"', "path.as_uri()", case="sweep")
 @pytest.mark.parametrize("kind", cases(SOURCES, *LONG))
 def test_a_report_stands_for_itself(results, kind):
     found = page(results, kind)
@@ -116,8 +116,8 @@ def test_a_report_stands_for_itself(results, kind):
         assert document.content["versions"]["jax"] in found.text
 
 
-@killed_by("report/report.html.j2", "</main>", "</main><script></script>", case="tune")
-@killed_by("report/report.html.j2", "default-src 'none'", "default-src 'unsafe-inline'", case="tune")
+@killed_by("output/report/report.html.j2", "</main>", "</main><script></script>", case="tune")
+@killed_by("output/report/report.html.j2", "default-src 'none'", "default-src 'unsafe-inline'", case="tune")
 @pytest.mark.parametrize("kind", cases(SOURCES, *LONG))
 def test_a_report_executes_nothing(results, kind):
     """It has no script, and its policy lets none run."""
@@ -141,8 +141,8 @@ SAID = {
 OWN = {"sweep": {"least", "greatest", "samples"}, "rare": {"spread"}, "tune": {"missed"}}  # that only the document has
 
 
-@killed_by("report/page.py", "repr(value))]", "round_for_table(value))]", case="tune")
-@killed_by("report/findings.py", "value - NORMAL * deviation", "value", case="identify")
+@killed_by("output.report.page", "repr(value))]", "round_for_table(value))]", case="tune")
+@killed_by("output.report.findings", "value - NORMAL * deviation", "value", case="identify")
 @pytest.mark.parametrize("kind", cases(SAID, *LONG))
 def test_numbers_are_those_of_the_document(results, kind):
     """All of what matters is there with all its digits, and nothing that is nowhere in the document."""
@@ -177,7 +177,7 @@ def test_numbers_are_those_of_the_document(results, kind):
     assert set(found.numbers) <= known
 
 
-@killed_by("report/proofs.py", "sum(not claim.reason for claim in proved)", "len(proved)")
+@killed_by("output.report.proofs", "sum(not claim.reason for claim in proved)", "len(proved)")
 def test_a_certificate_says_what_is_proved(results):
     found = page(results, "design")
     content = json.loads((results / "design.json").read_text())
@@ -194,7 +194,7 @@ def test_a_certificate_says_what_is_proved(results):
         wrong.unlink()
 
 
-@killed_by("report/page.py", 'False: "disproved"', 'False: "proved"')
+@killed_by("output.report.page", 'False: "disproved"', 'False: "proved"')
 def test_a_disproved_gain_is_said_to_be(tmp_path):
     out = command("certify", "slip-lmi", "--gain=-11753,48", "--json", status=1).stdout
     (tmp_path / "bad.json").write_text(out)
@@ -212,7 +212,7 @@ def named(value, names):
     return HOSTILE if value in names else value
 
 
-@killed_by("report/writing.py", "autoescape=True", "autoescape=False", case="tune")
+@killed_by("output.report.writing", "autoescape=True", "autoescape=False", case="tune")
 @pytest.mark.parametrize("kind", cases(["tune", "identify", "rare", "design"], *LONG))
 def test_hostile_names_are_text(results, tmp_path, kind):
     content = json.loads((results / f"{kind}.json").read_text())
@@ -236,8 +236,8 @@ def test_hostile_names_are_text(results, tmp_path, kind):
     assert HOSTILE in found.headings[0]
 
 
-@killed_by("report/page.py", "if is_within(path, folder) else None", "")
-@killed_by("report/page.py", "IMAGES.get(path.suffix.lower())", 'IMAGES.get(path.suffix.lower(), "image/png")')
+@killed_by("output.report.page", "if is_within(path, folder) else None", "")
+@killed_by("output.report.page", "IMAGES.get(path.suffix.lower())", 'IMAGES.get(path.suffix.lower(), "image/png")')
 def test_figures_outside_of_the_folder_are_not_shown(results, tmp_path):
     """Names in a document are not trusted; and what is no picture is none."""
     content = json.loads((results / "tune.json").read_text())
@@ -265,7 +265,7 @@ def test_figures_outside_of_the_folder_are_not_shown(results, tmp_path):
         assert base64.b64decode(data.partition(",")[2]) == b"\x89PNG drawn"
 
 
-@killed_by("report/documents.py", "path = folder / SUMMARY\n", "pass\n")
+@killed_by("output.report.documents", "path = folder / SUMMARY\n", "pass\n")
 @pytest.mark.slow
 def test_a_folder_of_results_is_one_file(results):
     """What `sweep --json` has printed beside the sweep's folder is the same result, and comes once."""
@@ -282,8 +282,12 @@ SWEEP_KEYS = {"digest": "", "sensitivity": {}, "failures": {}}
 PAPER_KEYS = {"paper": "", "rows": [], "figures": ["a.png"]}
 
 
-@killed_by("report/documents.py", "places = (path.parent / out, pathlib.Path(out))", "places = (pathlib.Path(out),)")
-@killed_by("report/documents.py", "places = (path.parent / out, pathlib.Path(out))", "places = (path.parent / out,)")
+@killed_by(
+    "output.report.documents", "places = (path.parent / out, pathlib.Path(out))", "places = (pathlib.Path(out),)"
+)
+@killed_by(
+    "output.report.documents", "places = (path.parent / out, pathlib.Path(out))", "places = (path.parent / out,)"
+)
 def test_a_folder_is_looked_for_beside_its_document(tmp_path, monkeypatch):
     """What a command printed in one folder is read in another, which has a folder of the same name."""
     there = tmp_path / "there"
@@ -297,7 +301,7 @@ def test_a_folder_is_looked_for_beside_its_document(tmp_path, monkeypatch):
         assert find_documents(there / "papers.json")[0].folder.resolve() == wanted / "one"
 
 
-@killed_by("report/documents.py", "if is_within(place, path.parent) and place.is_dir()", "if place.is_dir()")
+@killed_by("output.report.documents", "if is_within(place, path.parent) and place.is_dir()", "if place.is_dir()")
 @pytest.mark.parametrize("out", ["{outside}", "../outside", "outside", "link", "\0"])
 def test_a_folder_outside_of_the_document_is_not_read(tmp_path, monkeypatch, out):
     """A document of somebody else must not take pictures or a manifest from anywhere."""
@@ -324,7 +328,7 @@ def test_figures_of_a_sweep_do_not_lead_out_of_its_folder(tmp_path):
     assert Page(build_report(find_documents(tmp_path / "s"))).images == []
 
 
-@killed_by("report/experiments.py", "not in names():", "is None:")
+@killed_by("output.report.experiments", "not in names():", "is None:")
 def test_a_reproduction_names_no_file_as_its_scenario(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text("[plant]\nmass = 7.0\n")
@@ -334,7 +338,7 @@ def test_a_reproduction_names_no_file_as_its_scenario(tmp_path):
         build_report(find_documents(tmp_path / "x.json"))
 
 
-@killed_by("report/report.html.j2", "section.command | printable", "section.command")
+@killed_by("output/report/report.html.j2", "section.command | printable", "section.command")
 def test_the_command_of_a_document_is_said_to_be_its_own(results, tmp_path):
     """It is not a command of this package, and hides nothing behind a line's end or a mark of direction."""
     content = json.loads((results / "tune.json").read_text())
@@ -353,8 +357,8 @@ def test_the_file_of_a_document_is_no_option_of_a_command(results, tmp_path):
     assert text.endswith("diffabs verify ./--parts=evil")
 
 
-@killed_by("report/writing.py", "AttributeError, ValueError, OSError)", "AttributeError, OSError)")
-@killed_by("report/writing.py", "except RecursionError:", "except ZeroDivisionError:")
+@killed_by("output.report.writing", "AttributeError, ValueError, OSError)", "AttributeError, OSError)")
+@killed_by("output.report.writing", "except RecursionError:", "except ZeroDivisionError:")
 def test_lists_in_lists_are_one_line(results, tmp_path):
     invented_sweep(tmp_path / "s", {"type": "random"})
     (tmp_path / "s" / "manifest.json").write_text("[" * 100_000)
@@ -366,7 +370,7 @@ def test_lists_in_lists_are_one_line(results, tmp_path):
         build_report(find_documents(tmp_path / "x.json"))
 
 
-@killed_by("cli/report.py", 'errors="xmlcharrefreplace"', "")
+@killed_by("cli.report", 'errors="xmlcharrefreplace"', "")
 def test_half_of_a_surrogate_pair_is_a_replacement_character(results, tmp_path):
     """It is allowed in JSON and stands for the bytes of a file name that are no UTF-8; UTF-8 itself has none."""
     content = json.loads((results / "tune.json").read_text()) | {"scenario": "small \ud800"}
@@ -387,7 +391,7 @@ def test_the_command_says_where_it_is(results, tmp_path):
     assert left_in(tmp_path) == {"mine.html"}
 
 
-@killed_by("cli/sweep.py", "report.write_report_file([out], out / report.DEFAULT_NAME)", "pass")
+@killed_by("cli.sweep", "report.write_report_file([out], out / report.DEFAULT_NAME)", "pass")
 @pytest.mark.slow
 def test_a_sweep_with_figures_writes_its_report(results):
     text = (results / "sweep" / "report.html").read_text(encoding="utf-8")
@@ -412,9 +416,11 @@ def invented_sweep(folder, design, variables=("plant.mass", "plant.road.w4"), n=
     return content, Page(build_report(find_documents(folder))).text
 
 
-@killed_by("report/studies.py", 'content.get("made", {})', 'content["made"]')
-@killed_by("report/studies.py", 'None not in (failures["low"], failures["high"])', "True")
-@killed_by("report/studies.py", "return [] if worst is None else [shlex.join(command)]", 'return [" ".join(command)]')
+@killed_by("output.report.studies", 'content.get("made", {})', 'content["made"]')
+@killed_by("output.report.studies", 'None not in (failures["low"], failures["high"])', "True")
+@killed_by(
+    "output.report.studies", "return [] if worst is None else [shlex.join(command)]", 'return [" ".join(command)]'
+)
 def test_a_grid_has_a_report_without_intervals(tmp_path):
     _, text = invented_sweep(tmp_path / "my $sweep", {"type": "grid", "levels": 8})
     assert "failed: a probability of 0.25." in text
@@ -430,13 +436,13 @@ def test_of_a_saltelli_design_the_failures_are_among_the_rows_a(tmp_path):
     assert "64 runs; 0 diverged, 0 were refused. 4 of 16 failed: a probability of 0.25 (95 % interval" in text
 
 
-@killed_by("report/studies.py", 'content["never"].items()', "{}.items()")
+@killed_by("output.report.studies", 'content["never"].items()', "{}.items()")
 def test_runs_that_never_settle_are_in_the_report(tmp_path):
     _, text = invented_sweep(tmp_path / "s", {"type": "random"}, never=(7, 9, 40))
     assert "Runs with an infinite margin (never), left out of its statistics: 3, the first is sample 7" in text
 
 
-@killed_by("report/studies.py", "{content['diverged']:,}", "0")
+@killed_by("output.report.studies", "{content['diverged']:,}", "0")
 def test_runs_of_a_rare_event_that_diverged_are_counted(tmp_path):
     content = {"scenario": "small", "metric": "iae", "bound": 1.0, "unit": "s", "probability": 1e-4, "interval": [0, 1],
                "levels": [], "failures": {}, "note": "", "reason": "converged", "model": None, "runs": 5000, "seed": 0,
@@ -445,7 +451,7 @@ def test_runs_of_a_rare_event_that_diverged_are_counted(tmp_path):
     assert "95 % interval 0 to 1. Diverged runs: 1,234." in Page(build_report(find_documents(tmp_path))).text
 
 
-@killed_by("report/studies.py", 'yield from describe_turned_metrics(content.get("accuracy") or {})', "pass")
+@killed_by("output.report.studies", 'yield from describe_turned_metrics(content.get("accuracy") or {})', "pass")
 def test_a_metric_that_a_half_step_turns_is_in_the_report(tmp_path):
     content, text = invented_sweep(tmp_path / "s", {"type": "random"})
     assert "never with the other" not in text
@@ -456,8 +462,8 @@ def test_a_metric_that_a_half_step_turns_is_in_the_report(tmp_path):
     assert "margin is finite with one step and never with the other in 2 of 3 runs, the first sample 5" in text
 
 
-@killed_by("cli/sweep.py", "    _write_summary(out, result)\n    return result", "    return result")
-@killed_by("cli/sweep.py", "with console.show_before_errors(lambda: _show(result, setup, as_json)):", "if True:")
+@killed_by("cli.sweep", "    _write_summary(out, result)\n    return result", "    return result")
+@killed_by("cli.sweep", "with console.show_before_errors(lambda: _show(result, setup, as_json)):", "if True:")
 @pytest.mark.slow
 def test_a_sweep_whose_figure_fails_keeps_its_summary(tmp_path, monkeypatch):
     def fail(figure, path):
@@ -472,7 +478,7 @@ def test_a_sweep_whose_figure_fails_keeps_its_summary(tmp_path, monkeypatch):
     assert json.loads((out / "summary.json").read_text())["samples"] == 8
 
 
-@killed_by("report/page.py", '"not known" if value is None', '"0" if value is None')
+@killed_by("output.report.page", '"not known" if value is None', '"0" if value is None')
 def test_what_json_has_no_number_for_is_not_known(results, tmp_path):
     """The own start of a tuning may diverge, and a bound may be infinite."""
     content = json.loads((results / "tune.json").read_text())
@@ -483,7 +489,7 @@ def test_what_json_has_no_number_for_is_not_known(results, tmp_path):
     assert "bound not known" in text
 
 
-@killed_by("report/proofs.py", 'shlex.join(["diffabs", "verify", path])', 'f"diffabs verify {path}"')
+@killed_by("output.report.proofs", 'shlex.join(["diffabs", "verify", path])', 'f"diffabs verify {path}"')
 def test_commands_of_a_report_can_be_pasted(results, tmp_path):
     """By a shell's own rules each is one command with the file's name as one word."""
     path = tmp_path / "my $files" / "certificate.json"
@@ -494,7 +500,7 @@ def test_commands_of_a_report_can_be_pasted(results, tmp_path):
     assert shlex.split(line)[:3] == ["diffabs", "verify", str(path)]
 
 
-@killed_by("report/documents.py", 'content.get("format", CERTIFICATE_FORMAT) == CERTIFICATE_FORMAT', "True")
+@killed_by("output.report.documents", 'content.get("format", CERTIFICATE_FORMAT) == CERTIFICATE_FORMAT', "True")
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -523,7 +529,7 @@ def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, words):
     assert not (folder / "report.html").exists()
 
 
-@killed_by("report/documents.py", "if named and not documents:", "if False:")
+@killed_by("output.report.documents", "if named and not documents:", "if False:")
 @pytest.mark.parametrize(
     "text", ["hello", '{"a": 1}', "[1, 2]", '{"papers": {}, "out": "x"}', '{"format": "diffabs box proof 1"}']
 )
@@ -535,7 +541,7 @@ def test_a_file_of_others_is_refused_in_one_line(tmp_path, text):
     assert left_in(tmp_path) == {"x.json"}
 
 
-@killed_by("cli/report.py", "and not (target.is_file() and is_report(target))", "and False")
+@killed_by("cli.report", "and not (target.is_file() and is_report(target))", "and False")
 def test_files_of_others_stay(results, tmp_path):
     out = tmp_path / "report.html"
     out.write_text("<html>a thesis</html>")
@@ -569,7 +575,7 @@ def test_a_terminal_of_80_columns(results, tmp_path):
     assert left_in(tmp_path) == {"report.html"}
 
 
-@killed_by("report/charts.py", "HEIGHT - AXIS_BOTTOM - (y - low)", "AXIS_TOP + (y - low)")
+@killed_by("output.report.charts", "HEIGHT - AXIS_BOTTOM - (y - low)", "AXIS_TOP + (y - low)")
 def test_a_chart_has_its_points_where_they_are():
     """Of a straight line, the places are on one; a value that is no number has none."""
     text = draw_lines([(0, 1.0), (1, 2.0), (2, math.nan), (3, 4.0)], "x < 1", "y")

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from diffabs.core.pytree import canonical_dtypes, param, pytree, replace
 from diffabs.core.validity import check_part, find_problems
-from diffabs.roads import (
+from diffabs.parts.roads import (
     DRY_ASPHALT,
     ICE,
     RIG,
@@ -158,8 +158,8 @@ FLAT = (np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0]), np.array([0.0, 0.5, 0.5, 0.8, 
 STEEP_ENDS = (np.array([0.0, 0.3, 0.35, 0.4, 0.45, 1.0]), np.array([0.0, 0.05, 0.01, 0.8, 0.2, 0.3]))
 
 
-@killed_by("roads/tabulated.py", "w0 * m[1:] + w1 * m[:-1]", "w1 * m[1:] + w0 * m[:-1]")
-@killed_by("roads/tabulated.py", "jnp.where(steep, 3 * m0, d)", "d")
+@killed_by("parts.roads.tabulated", "w0 * m[1:] + w1 * m[:-1]", "w1 * m[1:] + w0 * m[:-1]")
+@killed_by("parts.roads.tabulated", "jnp.where(steep, 3 * m0, d)", "d")
 @pytest.mark.parametrize(
     ("slip", "mu"),
     [knots(seed, monotone) for seed in range(8) for monotone in (True, False)]
@@ -174,7 +174,7 @@ def test_tabulated_is_pchip(slip, mu):
     np.testing.assert_allclose(curve(road, slip), mu, rtol=1e-15, atol=1e-15)
 
 
-@killed_by("roads/piecewise_linear.py", "jnp.diff(y) / jnp.diff(x)", "jnp.diff(y)")
+@killed_by("parts.roads.piecewise_linear", "jnp.diff(y) / jnp.diff(x)", "jnp.diff(y)")
 def test_piecewise_linear_is_numpys_interpolation():
     """Odd, exact at the knots, and constant beyond the last one."""
     slip, mu = np.array([0.0, 0.07, 0.12, 0.15, 1.0]), np.array([0.0, 0.7, 0.85, 0.88, 0.6675])
@@ -184,8 +184,8 @@ def test_piecewise_linear_is_numpys_interpolation():
     np.testing.assert_allclose(curve(road, -s), -np.interp(s, slip, mu), rtol=1e-12, atol=1e-14)
 
 
-@killed_by("roads/along.py", "4 + 3 * t * t * (t - 2)", "4 + 3 * t * t * (t - 1)")
-@killed_by("roads/along.py", "c[-1] * ends", "0.0 * ends")
+@killed_by("parts.roads.along", "4 + 3 * t * t * (t - 2)", "4 + 3 * t * t * (t - 1)")
+@killed_by("parts.roads.along", "c[-1] * ends", "0.0 * ends")
 @pytest.mark.slow
 def test_a_factor_along_the_road_is_a_b_spline():
     """SciPy's, the first and the last factor going on; within the factors, and no steeper than they are."""
@@ -264,13 +264,13 @@ def test_patches_on_either_side_and_between():
     np.testing.assert_allclose(mu, [a, a, quarter, (a + b) / 2, b, b, (b + c) / 2, c, c], rtol=1e-14, atol=0)
 
 
-@killed_by("roads/patches.py", "edges = jnp.asarray(self.edges)", "edges = np.asarray(self.edges)")
+@killed_by("parts.roads.patches", "edges = jnp.asarray(self.edges)", "edges = np.asarray(self.edges)")
 def test_traced_edges_may_be_a_tuple_or_a_list():
     for edges in ((5.0,), [5.0]):
         np.testing.assert_allclose(curve(Patches(edges=edges), GRID, 0.0, 9.0), curve(SNOW, GRID), rtol=1e-12)
 
 
-@killed_by("roads/patches.py", "y * y * (3 - 2 * y)", "y")
+@killed_by("parts.roads.patches", "y * y * (3 - 2 * y)", "y")
 def test_patches_are_c1():
     """Slope zero at both ends of the ramp, 3/2 (after - before)/width in its middle."""
     road = Patches(width=2.0)
@@ -304,19 +304,19 @@ def test_monotone_curve_is_best_locked():
     np.testing.assert_allclose(slope[:, 0], 0.0, rtol=0, atol=0)
 
 
-@killed_by("roads/optimum.py", "jnp.isnan(values[1:]).any()", "False")
+@killed_by("parts.roads.optimum", "jnp.isnan(values[1:]).any()", "False")
 def test_a_road_of_nan_has_no_best_slip():
     assert np.isnan(peak(replace(ICE, {"c1": np.nan})).slip)
 
 
-@killed_by("roads/optimum.py", "values[1:]).any()", "values).any()")
+@killed_by("parts.roads.optimum", "values[1:]).any()", "values).any()")
 def test_a_road_of_nan_at_slip_0_is_best_locked():
     """A user's formula, 0/0 at slip 0."""
     rising = types.SimpleNamespace(friction=lambda slip, speed, distance: slip * slip / slip)
     assert peak(rising) == (1.0, 1.0)
 
 
-@killed_by("roads/optimum.py", " & (values[:-1] > 0)", "")
+@killed_by("parts.roads.optimum", " & (values[:-1] > 0)", "")
 @pytest.mark.parametrize("a", [0.001, 0.01, 0.1])
 def test_a_dip_below_zero_is_no_peak(a):
     """The rational curve dips below 0 next to slip 0. Against the first maximum of a fine grid in NumPy, from there."""
@@ -331,7 +331,7 @@ def test_a_dip_below_zero_is_no_peak(a):
 LINE_SLIPS = np.array([0.0, 0.07, 0.12, 0.151, 1.0])
 
 
-@killed_by("roads/optimum.py", "gap - jax.lax.stop_gradient(gap)", "0.0 * gap")
+@killed_by("parts.roads.optimum", "gap - jax.lax.stop_gradient(gap)", "0.0 * gap")
 def test_peak_of_straight_lines_moves_with_its_knot():
     """At a knot, where the slope jumps: slip and mu are those of the knot."""
     road = PiecewiseLinear(slip=LINE_SLIPS, mu=np.array([0.0, 0.7, 0.85, 0.88, 0.66]))
@@ -341,7 +341,7 @@ def test_peak_of_straight_lines_moves_with_its_knot():
     np.testing.assert_allclose(jacobian(found, road), expected, rtol=1e-9, atol=1e-12)
 
 
-@killed_by("roads/optimum.py", "jnp.abs(slope(s0)) < ", "jnp.abs(curvature) > 0.0 * ")
+@killed_by("parts.roads.optimum", "jnp.abs(slope(s0)) < ", "jnp.abs(curvature) > 0.0 * ")
 def test_peak_at_a_kink_beside_a_curve():
     """Half a table, which peaks at its knot, and half a smooth curve past its peak: slip and mu move with the knot."""
     table = PiecewiseLinear(slip=np.array([0.0, 0.1, 0.2, 1.0]), mu=np.array([0.0, 0.8, 1.0, 0.7]))
@@ -368,7 +368,7 @@ class Crossing:
         return jnp.where(rising < falling, rising, falling)
 
 
-@killed_by("roads/optimum.py", "mu(end + (s - s0))", "mu(end) + slope(end) * (s - s0)")
+@killed_by("parts.roads.optimum", "mu(end + (s - s0))", "mu(end) + slope(end) * (s - s0)")
 def test_two_derivatives_of_a_peak_where_curves_cross():
     """Against differences of the crossing that SciPy finds."""
 
@@ -388,7 +388,7 @@ def test_two_derivatives_of_a_peak_where_curves_cross():
     np.testing.assert_allclose(both, known, rtol=1e-6)
 
 
-@killed_by("roads/optimum.py", "jnp.where(at[1] == 0, jnp.nan, at[1])", "jnp.where(at[1] == 0, 1.0, at[1])")
+@killed_by("parts.roads.optimum", "jnp.where(at[1] == 0, jnp.nan, at[1])", "jnp.where(at[1] == 0, 1.0, at[1])")
 def test_peak_on_a_plateau_has_no_derivative():
     """Any slip from 0.07 to 0.151 is best."""
     road = PiecewiseLinear(slip=LINE_SLIPS, mu=np.array([0.0, 0.88, 0.88, 0.88, 0.66]))

@@ -8,8 +8,8 @@ import pytest
 from commands import assert_one_error_line, left_in, run
 from mutants import killed_by
 
-from diffabs.config.values import ScenarioError
-from diffabs.design.proof.certificate import Certificate
+from diffabs.host.values import ScenarioError
+from diffabs.robust.design.proof.certificate import Certificate
 from diffabs.scenario import scenario, toml
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
@@ -39,7 +39,7 @@ def strange(path, kind):
 KINDS = ["a folder", "a pipe", "a loop"]
 
 
-@killed_by("runtime/files.py", "if not stat.S_ISREG(os.fstat(handle).st_mode):", "if False:")
+@killed_by("host.files", "if not stat.S_ISREG(os.fstat(handle).st_mode):", "if False:")
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_no_file_is_not_read(tmp_path, kind):
     scenario = strange(tmp_path / "x.toml", kind)
@@ -121,7 +121,7 @@ SHORT_KEYS = [
 ]
 
 
-@killed_by("scenario/toml.py", 'dots + bool(token["dot"])', "0")
+@killed_by("scenario.toml", 'dots + bool(token["dot"])', "0")
 @pytest.mark.parametrize("text", LONG_KEYS)
 def test_a_key_of_many_words_is_refused_before_it_is_parsed(monkeypatch, text):
     """`tomllib` takes hours for a key of 250,000 words."""
@@ -131,7 +131,7 @@ def test_a_key_of_many_words_is_refused_before_it_is_parsed(monkeypatch, text):
         toml.parse_toml(text)
 
 
-@killed_by("scenario/toml.py", '0 if token["end"] else dots', "dots")
+@killed_by("scenario.toml", '0 if token["end"] else dots', "dots")
 @pytest.mark.parametrize("text", SHORT_KEYS)
 def test_dots_outside_of_keys_are_allowed(text):
     assert toml.parse_toml(text) == tomllib.loads(text)
@@ -158,7 +158,7 @@ def test_a_message_does_not_repeat_a_long_key(file):
     assert refused("simulate", file(f"[{key}]\n[{key}]")).endswith("twice (at line 2, column 10002)\n")
 
 
-@killed_by("scenario/scenario.py", "if len(section) > MAX_OBJECTIVES:", "if False:")
+@killed_by("scenario.scenario", "if len(section) > MAX_OBJECTIVES:", "if False:")
 def test_more_objectives_than_can_be_checked(file):
     text = "".join(f"[objective.o{i}]\ntype = 'iae'\n" for i in range(201))
     assert refused("simulate", file(text)).endswith("objective has 201 entries, outside [0, 200]\n")

@@ -34,8 +34,8 @@ LOGGERS = {
 }
 
 
-@killed_by("runtime/separated.py", "    return fits[0]\n", '    return ","\n')
-@killed_by("scenario/measurements.py", 'return "," in first', "return False")
+@killed_by("host.separated", "    return fits[0]\n", '    return ","\n')
+@killed_by("scenario.measurements", 'return "," in first', "return False")
 @pytest.mark.parametrize("name", LOGGERS)
 def test_files_of_loggers(csv, name):
     found = read_measurements(csv(LOGGERS[name]), UNITS, renamed={"slip": "slip"} if "slip;" in LOGGERS[name] else {},

@@ -125,13 +125,13 @@ def folder(tmp_path, monkeypatch) -> Iterator[None]:
             del sys.modules[name]
 
 
-@killed_by("scenario/outside.py", 'if name.endswith(".py"):', "if False:", case="file.py")
-@killed_by("scenario/outside.py", "_find_incomplete_class(module) or ", "", case="misspelled")
-@killed_by("scenario/outside.py", "return -len(close), len(contract - methods)", "return 0, 0", case="outptu")
-@killed_by("scenario/outside.py", 'value.dtype.kind in "OSU"', "False", case="none")
-@killed_by("roads/sign.py", "mu * slips >= 0)", "mu * slips >= -9)", case="driving")
-@killed_by("roads/sign.py", "slips == 0, abs(mu) <= MAX_FRICTION_AT_REST", "slips == 0, True", case="resting")
-@killed_by("cli/console.py", "if road is not None and (line", "if False and (line", case="negative")
+@killed_by("scenario.outside", 'if name.endswith(".py"):', "if False:", case="file.py")
+@killed_by("scenario.outside", "_find_incomplete_class(module) or ", "", case="misspelled")
+@killed_by("scenario.outside", "return -len(close), len(contract - methods)", "return 0, 0", case="outptu")
+@killed_by("scenario.outside", 'value.dtype.kind in "OSU"', "False", case="none")
+@killed_by("parts.roads.sign", "mu * slips >= 0)", "mu * slips >= -9)", case="driving")
+@killed_by("parts.roads.sign", "slips == 0, abs(mu) <= MAX_FRICTION_AT_REST", "slips == 0, True", case="resting")
+@killed_by("cli.console", "if road is not None and (line", "if False and (line", case="negative")
 @pytest.mark.parametrize(
     ("module", "text", "command", "line"), MISTAKES, ids=[readable_id(mistake[0]) for mistake in MISTAKES]
 )
@@ -141,7 +141,7 @@ def test_a_mistake_in_a_part_of_ones_own_is_one_line(module, text, command, line
     assert line in result.stderr
 
 
-@killed_by("scenario/outside.py", "if any(getattr", "if all(getattr")
+@killed_by("scenario.outside", "if any(getattr", "if all(getattr")
 def test_a_module_may_hold_other_classes_beside_its_parts(tmp_path):
     helper = (
         "\n@pytree\nclass Table:\n    def look_up(self):\n        return 1.0\n\nclass Plain:\n    def say(self): ...\n"

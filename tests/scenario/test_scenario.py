@@ -10,16 +10,16 @@ from mutants import killed_by
 from seams import replace_seam
 
 from diffabs import controllers, roads
-from diffabs.objectives import BRAKING
+from diffabs.engine.types import Adaptive, FixedStep
+from diffabs.parts.objectives import BRAKING
 from diffabs.scenario import outside, registry, scenario
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import dump, load, names
 from diffabs.scenario.section_design import DesignTask
 from diffabs.scenario.section_sweep import build_study
 from diffabs.scenario.section_tune import Goal
-from diffabs.simulate.types import Adaptive, FixedStep
-from diffabs.sweep.distributions import Uniform
 from diffabs.tune import risk
+from diffabs.uncertainty.sweep.distributions import Uniform
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable")
 
@@ -41,7 +41,7 @@ def test_packaged_names():
 
 
 @killed_by(
-    "scenario/parameter_paths.py", "return tuple(scale_to_si(end, self.scale) for end in ends)", "return tuple(ends)"
+    "scenario.parameter_paths", "return tuple(scale_to_si(end, self.scale) for end in ends)", "return tuple(ends)"
 )
 def test_slip_lmi_is_the_papers_example():
     s = load("slip-lmi")
@@ -72,8 +72,8 @@ def test_slip_estimator_is_the_papers_example():
     assert s.loop.initial.speed == pytest.approx(100 / 3.6, rel=1e-15)
 
 
-@killed_by("scenario/scenario.py", 'for name in ("design", "tune", "sweep")}', 'for name in ("tune", "sweep")}')
-@killed_by("scenario/scenario.py", 'for name in ("design", "tune", "sweep")}', 'for name in ("design", "sweep")}')
+@killed_by("scenario.scenario", 'for name in ("design", "tune", "sweep")}', 'for name in ("tune", "sweep")}')
+@killed_by("scenario.scenario", 'for name in ("design", "tune", "sweep")}', 'for name in ("design", "sweep")}')
 @pytest.mark.parametrize("name", names())
 def test_packaged_scenario_survives_dump_and_load(name, file):
     first = load(name)
@@ -127,7 +127,7 @@ def test_everything_nested_survives_dump_and_load(file):
     assert jax.numpy.array_equal(jax.random.key_data(first.key()), jax.random.key_data(jax.random.key(42)))
 
 
-@killed_by("scenario/registry.py", "_numbers(item, depth - 1, spec,", "_numbers(item, 0, spec,")
+@killed_by("scenario.registry", "_numbers(item, depth - 1, spec,", "_numbers(item, 0, spec,")
 def test_a_matrix_survives_dump_and_load(file):
     first = load("arm-balance", ["controller=observer-feedback"], integrated=False)
     assert first.loop.controller.transition.shape == (6, 6)
@@ -152,9 +152,9 @@ class Chooser:
 """
 
 
-@killed_by("scenario/registry.py", "1 if default >= 1 else -MAX_STATIC", "1")
-@killed_by("scenario/registry.py", "value if field.default is dataclasses.MISSING else field.default", "value")
-@killed_by("scenario/registry.py", "type(value) is not int", "not isinstance(value, int)")
+@killed_by("scenario.registry", "1 if default >= 1 else -MAX_STATIC", "1")
+@killed_by("scenario.registry", "value if field.default is dataclasses.MISSING else field.default", "value")
+@killed_by("scenario.registry", "type(value) is not int", "not isinstance(value, int)")
 @pytest.mark.parametrize("changes", [[], ["order=-2", "taps=9", "scale=4", "soft=true", "mode=firm"]], ids=["0", "5"])
 def test_choices_of_a_part_of_ones_own_are_read_again(changes, tmp_path, file):
     (tmp_path / "choosers.py").write_text(CHOOSER)
@@ -172,8 +172,8 @@ def test_choices_of_a_part_of_ones_own_are_read_again(changes, tmp_path, file):
     sys.modules.pop("choosers")
 
 
-@killed_by("scenario/registry.py", "    if isinstance(part, tuple | list):", "    if isinstance(part, tuple):")
-@killed_by("scenario/registry.py", "if isinstance(value, tuple | list) else", "if isinstance(value, tuple) else")
+@killed_by("scenario.registry", "    if isinstance(part, tuple | list):", "    if isinstance(part, tuple):")
+@killed_by("scenario.registry", "if isinstance(value, tuple | list) else", "if isinstance(value, tuple) else")
 def test_parts_in_a_list_are_described_like_those_in_a_tuple():
     listed, tupled = (roads.Patches(roads=kind([roads.SNOW, roads.SPLINE_B]), edges=[5.0]) for kind in (list, tuple))
     assert [path for path, _ in registry.part_choices(listed, "road")] == ["road", "road.roads.0", "road.roads.1"]
@@ -310,7 +310,7 @@ def test_default_members_of_a_tuple_can_be_changed(file):
     assert s.loop.plant.road.roads[1].c1 == 0.3
 
 
-@killed_by("scenario/scenario.py", "if not removed:", "if True:")
+@killed_by("scenario.scenario", "if not removed:", "if True:")
 def test_a_note_names_what_a_replaced_part_takes_along():
     s = load("slip-lmi", ["road=snow", "plant.mass=6"])
     assert s.notes == ("road=snow removes sweep.over.road.w4, sweep.over.road.a of the replaced part",)
@@ -334,7 +334,7 @@ damping = 0.25
 
 
 @killed_by(
-    "scenario/parameter_paths.py",
+    "scenario.parameter_paths",
     '            pending += [(f"{path}.{key}", item) for key, item in list(value.items())[::-1]]\n            continue',
     "            flat[path] = value\n            continue",
 )
@@ -455,7 +455,7 @@ WHAT = Goal(
 
 
 @killed_by(
-    "scenario/parameter_paths.py", "return tuple(scale_to_si(end, self.scale) for end in ends)", "return tuple(ends)"
+    "scenario.parameter_paths", "return tuple(scale_to_si(end, self.scale) for end in ends)", "return tuple(ends)"
 )
 def test_what_is_tuned_is_the_same_however_it_is_written(file):
     dotted = load(
@@ -561,8 +561,8 @@ def test_another_part_takes_what_is_tuned_with_it(change):
     assert again.free == {"controller.kp": (1000.0, 5000.0)}
 
 
-@killed_by("scenario/scenario.py", "[0, self.seed]", "[self.seed, 0]", case="7")
-@killed_by("scenario/scenario.py", "and 0 <= self.seed < 2**31:", ":", case="1099511627776")
+@killed_by("scenario.scenario", "[0, self.seed]", "[self.seed, 0]", case="7")
+@killed_by("scenario.scenario", "and 0 <= self.seed < 2**31:", ":", case="1099511627776")
 @pytest.mark.parametrize("seed", [0, 7, 2**31 - 1, 2**40])
 def test_the_key_of_a_run_is_that_of_jax(seed):
     found, wanted = scenario.Scenario("mine", seed=seed).key(), jax.random.key(seed)
@@ -570,8 +570,8 @@ def test_the_key_of_a_run_is_that_of_jax(seed):
     np.testing.assert_array_equal(jax.random.key_data(found), jax.random.key_data(wanted))
 
 
-@killed_by("scenario/scenario.py", 'keys[:-1] if place == "type" else keys', "keys")
-@killed_by("scenario/scenario.py", "isinstance(part, str) and part != old_type", "isinstance(part, str)")
+@killed_by("scenario.scenario", 'keys[:-1] if place == "type" else keys', "keys")
+@killed_by("scenario.scenario", "isinstance(part, str) and part != old_type", "isinstance(part, str)")
 def test_a_type_alone_replaces_a_part_too():
     assert "reference.time_constant" in load("slip-cured").tune.free
     found = load("slip-cured", ["reference.type=limited-slip"])
@@ -584,7 +584,7 @@ def test_a_type_alone_replaces_a_part_too():
     assert same.notes == ()
 
 
-@killed_by("scenario/scenario.py", 'node.get("type", _usual_type(table, replaced))', 'node.get("type")')
+@killed_by("scenario.scenario", 'node.get("type", _usual_type(table, replaced))', 'node.get("type")')
 def test_the_type_of_the_usual_part_replaces_nothing():
     """`slip-lmi` gives its start no type, and a rig has a brake's start."""
     found = load("slip-lmi", ["initial.type=brake-start"])
@@ -605,7 +605,7 @@ INTERVALS = (
 )
 
 
-@killed_by("scenario/parameter_paths.py", "is_interval = isinstance(value, dict) and", "is_interval = False and")
+@killed_by("scenario.parameter_paths", "is_interval = isinstance(value, dict) and", "is_interval = False and")
 @pytest.mark.parametrize("form", INTERVALS)
 def test_an_interval_has_one_notation(file, form):
     """In files and on the command line, for a design, a tuning, its drawn runs and a sweep."""
@@ -640,7 +640,7 @@ def test_an_interval_on_the_command_line_and_of_a_list():
 # What varies in a sweep
 
 
-@killed_by("scenario/parameter_paths.py", 'f"{path}.".startswith("plant.road.")', 'path.startswith("plant.road.")')
+@killed_by("scenario.parameter_paths", 'f"{path}.".startswith("plant.road.")', 'path.startswith("plant.road.")')
 def test_a_choice_of_roads_is_written_and_read(file):
     there = load("slip-lmi", ['sweep.over={road=["rig", "snow"], plant={mass={low=5.3,high=6.2}}}'])
     again = load(file(dump(there)))
@@ -649,10 +649,8 @@ def test_a_choice_of_roads_is_written_and_read(file):
     assert again.sweep.over["plant.road"].parts["snow"] is roads.SNOW
 
 
-@killed_by("scenario/parameter_paths.py", ', ("sweep", "design", "levels"))', ")", case="nested")
-@killed_by(
-    "scenario/section_sweep.py", "levels = _by_varied_path(levels,", "levels = levels or _by_varied_path(levels,"
-)
+@killed_by("scenario.parameter_paths", ', ("sweep", "design", "levels"))', ")", case="nested")
+@killed_by("scenario.section_sweep", "levels = _by_varied_path(levels,", "levels = levels or _by_varied_path(levels,")
 @pytest.mark.parametrize(
     "levels",
     [
@@ -671,9 +669,7 @@ def test_levels_of_a_grid_have_the_paths_of_what_varies(file, levels):
     assert load(file(dump(chosen))).sweep.design == chosen.sweep.design
 
 
-@killed_by(
-    "scenario/parameter_paths.py", "return [*table, canonical_path", "return [*table] or [*table, canonical_path"
-)
+@killed_by("scenario.parameter_paths", "return [*table, canonical_path", "return [*table] or [*table, canonical_path")
 def test_a_level_of_a_grid_is_changed(file):
     """The file has the paths with dots."""
     path = file("""plant = "mirrored-rig"
@@ -689,7 +685,7 @@ def test_a_level_of_a_grid_is_changed(file):
     assert build_study(load(path, changes)).samples == 20
 
 
-@killed_by("scenario/registry.py", "is_class and inner_family == family", "inner_family == family")
+@killed_by("scenario.registry", "is_class and inner_family == family", "inner_family == family")
 def test_a_constant_has_its_own_inner_part(tmp_path):
     text = "from diffabs import roads\nWORN = roads.Scaled(road=roads.ICE, scale=0.8)\n"
     (tmp_path / "worn_roads.py").write_text(text)
@@ -700,7 +696,7 @@ def test_a_constant_has_its_own_inner_part(tmp_path):
     sys.modules.pop("worn_roads")
 
 
-@killed_by("scenarios/literature-mathworks.toml", "0.249960856269", "0.249958735168", case="dry")
+@killed_by("scenario/scenarios/literature-mathworks.toml", "0.249960856269", "0.249958735168", case="dry")
 @pytest.mark.parametrize(
     ("name", "share"), [("literature-mathworks", 1.0), ("literature-vipulsree", 0.8)], ids=["dry", "case 1"]
 )
@@ -710,7 +706,7 @@ def test_the_load_of_a_quarter_car_in_feet(name, share):
     assert scale == pytest.approx(share * 32.18 * 0.3048 / 9.81 / 4, rel=1e-11)
 
 
-@killed_by("scenario/section_design.py", "if ends[0] < ends[1]}\n        paths", "}\n        paths")
+@killed_by("scenario.section_design", "if ends[0] < ends[1]}\n        paths", "}\n        paths")
 def test_a_single_value_of_the_model_is_no_range():
     changes = ["reference=setpoint", "reference.value=0.2", "design.over.reference.slip=0.2,0.2"]
     chosen = load("slip-lmi", changes, integrated=False)

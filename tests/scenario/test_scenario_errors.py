@@ -238,14 +238,14 @@ BAD = [
 ]
 
 
-@killed_by("scenario/registry.py", "'lists of ' * (depth - 1)", "''")
+@killed_by("scenario.registry", "'lists of ' * (depth - 1)", "''")
 @killed_by(
-    "scenario/parameter_paths.py",
+    "scenario.parameter_paths",
     "        if not (np.all(low < high) or (not or_else and np.all(low <= high))):",
     "        if False:",
 )
 @killed_by(
-    "scenario/parameter_paths.py",
+    "scenario.parameter_paths",
     "        if not (allowed.holds(low) and allowed.holds(high)):",
     "        if False:",
 )
@@ -324,7 +324,7 @@ def test_nothing_is_evaluated(file):
 
 @pytest.fixture
 def checked_step(monkeypatch):
-    from diffabs.simulate.stability import stable_step
+    from diffabs.engine.stability import stable_step
 
     replace_seam(monkeypatch, "stable_step", stable_step)
 
@@ -361,8 +361,8 @@ def test_a_start_that_overflows_is_refused_in_a_line():
         load("arm-balance", ["initial.theta=1e300"])
 
 
-@killed_by("scenario/section_sweep.py", "lines := describe_missing_inner_parts(family, item,", "lines := () and (item,")
-@killed_by("scenario/registry.py", "and type_name(inner) is None:", "and inner is None:")
+@killed_by("scenario.section_sweep", "lines := describe_missing_inner_parts(family, item,", "lines := () and (item,")
+@killed_by("scenario.registry", "and type_name(inner) is None:", "and inner is None:")
 @pytest.mark.parametrize(
     "choice", ['"sampled"', "{type='sampled', period=1e-3}", "{type='sampled', controller={kp=1}}"]
 )
@@ -377,11 +377,9 @@ def test_a_choice_of_a_sweep_names_the_part_inside(choice):
     }
 
 
+@killed_by("scenario.registry", "lines += describe_missing_inner_parts(inner_family, inner, where)", "0", case="scaled")
 @killed_by(
-    "scenario/registry.py", "lines += describe_missing_inner_parts(inner_family, inner, where)", "0", case="scaled"
-)
-@killed_by(
-    "scenario/registry.py",
+    "scenario.registry",
     "describe_missing_inner_parts(inner_family, item,",
     "() and (inner_family, item,",
     case="patches",

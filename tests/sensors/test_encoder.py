@@ -6,7 +6,7 @@ import numpy as np
 from mutants import killed_by
 
 from diffabs.core.protocols import BrakeOutput, Clock, Memory
-from diffabs.sensors import EncoderSlip
+from diffabs.parts.sensors import EncoderSlip
 
 PERIOD = 0.01
 
@@ -28,8 +28,8 @@ def samples(sensor, count):
     return seen
 
 
-@killed_by("sensors/encoder.py", "(v - w) / (v + self.floor)", "(v - w) / v")
-@killed_by("sensors/encoder.py", "(signal.distance - m.vehicle) / self.period", "signal.speed")
+@killed_by("parts.sensors.encoder", "(v - w) / (v + self.floor)", "(v - w) / v")
+@killed_by("parts.sensors.encoder", "(signal.distance - m.vehicle) / self.period", "signal.speed")
 def test_speeds_are_means_over_the_last_period():
     with jax.enable_x64(True):
         seen = samples(EncoderSlip(period=PERIOD), 5)
@@ -40,7 +40,7 @@ def test_speeds_are_means_over_the_last_period():
         np.testing.assert_allclose(one.slip, (v - w) / (v + 0.01), rtol=1e-12)
 
 
-@killed_by("sensors/encoder.py", "jnp.where(x < self.dead_zone, 0.0, x)", "x")
+@killed_by("parts.sensors.encoder", "jnp.where(x < self.dead_zone, 0.0, x)", "x")
 def test_below_the_dead_zone_a_speed_is_zero():
     with jax.enable_x64(True):
         slow, slower = samples(EncoderSlip(period=PERIOD, dead_zone=9.0), 2)

@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 
-from diffabs.controllers import BalanceFeedback
 from diffabs.core.pytree import replace
+from diffabs.engine.types import FixedStep
 from diffabs.linear.balance_model import BalanceModel
-from diffabs.plants import ArmBalance
+from diffabs.parts.controllers import BalanceFeedback
+from diffabs.parts.plants import ArmBalance
 from diffabs.scenario.defaults import balancing
-from diffabs.simulate.types import FixedStep
 
 HANGING = ArmBalance(arm_length=-0.5)
 START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])  # of the paper's Fig. 3

@@ -1,6 +1,6 @@
 """Prove the claims of a saved certificate again, with fractions only: python tests/support/checker.py FILE.json
 
-Shares nothing with the package; `diffabs.design.proof.exact` says what the claims mean. Floats are the rationals
+Shares nothing with the package; `diffabs.robust.design.proof.exact` says what the claims mean. Floats are the rationals
 that they are; entries of A, B and Bw may be off by a relative 2^-40: `Matrix` carries such errors along. Says what was
 proved; exits with 0 if all was, 1 if something was not, 2 if the file cannot be read.
 """

@@ -8,8 +8,8 @@ from signals import Script, seen
 import diffabs as d
 from diffabs.core.protocols import BrakeOutput, no_flow, no_memory
 from diffabs.core.pytree import param, pytree, static
-from diffabs.references import FixedSlip
-from diffabs.stops import NoStop
+from diffabs.parts.references import FixedSlip
+from diffabs.parts.stops import NoStop
 
 H = 1e-3
 

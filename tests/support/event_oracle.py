@@ -29,8 +29,8 @@ from scipy.interpolate import PchipInterpolator
 
 import diffabs as d
 from diffabs import controllers, plants, references, roads
+from diffabs.parts.stops import SpeedReached, Standstill
 from diffabs.scenario.defaults import braking
-from diffabs.stops import SpeedReached, Standstill
 
 G = 9.81
 EXCEEDS = 1 + 1e-6  # what a later maximum must be

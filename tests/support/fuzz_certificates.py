@@ -15,8 +15,8 @@ from fuzz_files import damaged, edited, in_a_line
 from project import ROOT
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_lyapunov
 
-from diffabs.design.polytopes import Polytope, Schedule
-from diffabs.design.proof.certificate import Certificate, Claim
+from diffabs.robust.design.polytopes import Polytope, Schedule
+from diffabs.robust.design.proof.certificate import Certificate, Claim
 
 ARRAYS = {"A", "B", "gain", "nodes", "P", "Q", "R", "W", "x0", "Bw", "C", "D", "limit", "points", "rates"}
 ROUNDING = 1e-7  # of the norm of a matrix, for its eigenvalues

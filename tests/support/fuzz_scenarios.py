@@ -25,11 +25,11 @@ import numpy as np
 
 from diffabs.core.protocols import BrakeOutput
 from diffabs.core.pytree import elements, get
+from diffabs.engine.run import measure
+from diffabs.engine.stability import stable_step
+from diffabs.engine.types import FixedStep, Run
 from diffabs.scenario import registry, toml
 from diffabs.scenario.scenario import Scenario, ScenarioError, dump, loads
-from diffabs.simulate.run import measure
-from diffabs.simulate.stability import stable_step
-from diffabs.simulate.types import FixedStep, Run
 
 PER_STRUCTURE = 200
 STEPS = 300

@@ -16,10 +16,10 @@ from sweeping import SCENARIO, described
 
 from diffabs.cli import sweep as commands_sweep
 from diffabs.scenario import scenario
-from diffabs.sweep import Results, SweepError, sweep
-from diffabs.sweep.engines import ComputedChunk
-from diffabs.sweep.seal import CHUNK_NAME_PATTERN
-from diffabs.sweep.statistics.summary import summarise_sweep
+from diffabs.uncertainty.sweep import Results, SweepError, sweep
+from diffabs.uncertainty.sweep.engines import ComputedChunk
+from diffabs.uncertainty.sweep.seal import CHUNK_NAME_PATTERN
+from diffabs.uncertainty.sweep.statistics.summary import summarise_sweep
 
 TEXT = SCENARIO.replace("samples = 3200", "samples = 290")
 SAMPLE = 7

@@ -30,7 +30,7 @@ COPIED = ("diffabs", "tests", "experiments", "docs", "examples", "benchmarks")
 
 
 class Mutant(NamedTuple):
-    """A change of the text `old` in diffabs/`file` to `new`, and the test that fails then, as pytest names it."""
+    """A change of the text `old` in `file` of diffabs to `new`, and the test that fails then, as pytest names it."""
 
     file: str
     old: str
@@ -38,16 +38,25 @@ class Mutant(NamedTuple):
     test: str
 
 
-def killed_by(file: str, old: str, new: str, case: str | None = None) -> pytest.MarkDecorator:
-    """Return a mark for a test that fails where each `old` in diffabs/`file` is replaced by `new`.
+def killed_by(module: str, old: str, new: str, case: str | None = None) -> pytest.MarkDecorator:
+    """Return a mark for a test that fails where each `old` in a module of diffabs is replaced by `new`.
 
+    module: "engine.run", or the path of a file that is no module, "compiler/native/drive.h"
     case: the id of the parameters with which it fails; by default with any"""
-    return pytest.mark.killed_by(file, old, new, case)
+    return pytest.mark.killed_by(module, old, new, case)
 
 
 def find_mutants(tests: pathlib.Path = TESTS) -> list[Mutant]:
     """Return the mutants of all tests in a folder, as their source says, in the order of files and lines."""
     return [mutant for file in sorted(tests.rglob("test_*.py")) for mutant in _read_marks(file, tests)]
+
+
+def module_file(module: str) -> str:
+    """Return the path of a mark's module in diffabs: that of a package is its `__init__.py`."""
+    if "/" in module:
+        return module
+    path = module.replace(".", "/")
+    return f"{path}/__init__.py" if (ROOT / "diffabs" / path).is_dir() else f"{path}.py"
 
 
 def _read_marks(file: pathlib.Path, tests: pathlib.Path) -> Iterator[Mutant]:
@@ -62,7 +71,9 @@ def _read_marks(file: pathlib.Path, tests: pathlib.Path) -> Iterator[Mutant]:
                     given = {one.arg: ast.literal_eval(one.value) for one in mark.keywords}
                     texts = [ast.literal_eval(one) for one in mark.args]
                     case = f"[{given['case']}]" if "case" in given else ""
-                    yield Mutant(*texts, f"{file.relative_to(tests)}::{prefix}{test.name}{case}")
+                    yield Mutant(
+                        module_file(texts[0]), *texts[1:], f"{file.relative_to(tests)}::{prefix}{test.name}{case}"
+                    )
 
 
 def judge(mutant: Mutant, folder: pathlib.Path, limit: float = LIMIT_S) -> str:

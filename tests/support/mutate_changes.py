@@ -1,6 +1,6 @@
 """Which changes of the lines that you wrote does no test notice? Cosmic Ray makes them one after the other.
 
-    python tests/support/mutate_changes.py [--base main] [--tests tests/config/test_values.py ...]
+    python tests/support/mutate_changes.py [--base main] [--tests tests/host/test_values.py ...]
 
 takes the lines of diffabs/ that differ between HEAD and the base, changes operators, numbers and conditions in them,
 and prints each change with which the tests still pass. It works in a worktree of its own, so commit first. By default

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import PchipInterpolator
 
-import diffabs.roads as roads
-from diffabs.plants import LabRig, MirroredRig, QuarterCar
+import diffabs.parts.roads as roads
+from diffabs.parts.plants import LabRig, MirroredRig, QuarterCar
 
 G = 9.81
 

@@ -31,7 +31,7 @@ from diffabs.core.protocols import (
     Tracking,
 )
 from diffabs.core.pytree import canonical_dtypes
-from diffabs.simulate.step.runge_kutta import rk4_step
+from diffabs.engine.step.runge_kutta import rk4_step
 
 FAMILIES = (roads, plants, controllers, references, actuators, sensors, objectives, stops, blocks)
 

@@ -14,8 +14,8 @@ import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.pytree import parameters, replace
+from diffabs.parts.stops import Fallen, SpeedReached, Standstill
 from diffabs.scenario.defaults import braking
-from diffabs.stops import Fallen, SpeedReached, Standstill
 
 BRAKING = {
     **objectives.BRAKING,

@@ -8,9 +8,9 @@ import numpy as np
 from test_native import CELLS, still
 
 from diffabs.compiler.runtime import toolchain
-from diffabs.reach import RunClaim, engine, prove_box
-from diffabs.reach.engine import Prover, apply_operation
-from diffabs.reach.equations import derive_equations
+from diffabs.robust.reach import RunClaim, engine, prove_box
+from diffabs.robust.reach.engine import Prover, apply_operation
+from diffabs.robust.reach.equations import derive_equations
 from diffabs.scenario.scenario import load
 
 LIMITED = ["controller.low=0", "controller.high=9.03"]

@@ -9,10 +9,10 @@ from scipy.integrate import solve_ivp
 from shown_state import ShownState
 
 import diffabs as d
-from diffabs.controllers import PID
 from diffabs.core.pytree import param, pytree
-from diffabs.references import Setpoint
-from diffabs.stops import NoStop
+from diffabs.parts.controllers import PID
+from diffabs.parts.references import Setpoint
+from diffabs.parts.stops import NoStop
 
 PIECES = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-14}
 

@@ -10,7 +10,7 @@ import jax
 
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import loads
-from diffabs.sweep.manifest import MANIFEST_FORMAT
+from diffabs.uncertainty.sweep.manifest import MANIFEST_FORMAT
 
 
 def rig(start, stop):

@@ -28,7 +28,7 @@ from project import ROOT
 PAGE = ROOT / "docs" / "test-status.md"
 OUT = ROOT / "out" / "tiers"
 PYTEST = ("-m", "pytest", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
-ENGINE = ("tests/core", "tests/simulate", "tests/objectives", "tests/controllers", "tests/actuators")
+ENGINE = ("tests/core", "tests/engine", "tests/objectives", "tests/controllers", "tests/actuators")
 USERS_FLAGS = MappingProxyType({"DIFFABS_TEST_XLA": "default"})
 SHOWN_FAILURES = 12
 SLOW_PARTS = 6

@@ -23,10 +23,10 @@ from mutants import killed_by
 from seams import replace_seam
 from sweeping import PATIENCE, SCENARIO, chunks, command, described, environment, free_port, started, until
 
-from diffabs.runtime.process import core_count
-from diffabs.sweep import SweepError, cluster, sweep
-from diffabs.sweep.cluster import Dask
-from diffabs.sweep.manifest import Seals, describe_owner
+from diffabs.host.process import core_count
+from diffabs.uncertainty.sweep import SweepError, cluster, sweep
+from diffabs.uncertainty.sweep.cluster import Dask
+from diffabs.uncertainty.sweep.manifest import Seals, describe_owner
 
 pytestmark = pytest.mark.usefixtures("without_load", "any_step_is_stable", "compiled_before")
 
@@ -261,7 +261,7 @@ def test_the_command_is_killed_or_interrupted(scenario, tmp_path, how):
     assert document["digest"] == other["digest"]
 
 
-@killed_by("sweep/cluster.py", "if stopping() and not client.nthreads():", "if False:")
+@killed_by("uncertainty.sweep.cluster", "if stopping() and not client.nthreads():", "if False:")
 @pytest.mark.parametrize(
     ("threads", "stopped", "somebody"), [({}, True, False), ({}, False, True), ({"a": 1}, True, True)]
 )
@@ -287,7 +287,9 @@ def listening():
 
 
 @pytest.mark.slow
-@killed_by("sweep/cluster.py", 'worker_dashboard_address=f"{LOOPBACK_ADDRESS}:0"', 'worker_dashboard_address=":0"')
+@killed_by(
+    "uncertainty.sweep.cluster", 'worker_dashboard_address=f"{LOOPBACK_ADDRESS}:0"', 'worker_dashboard_address=":0"'
+)
 def test_nobody_else_reaches_scheduler_workers_and_their_pages():
     before = listening()
     with Dask(workers=1)._client() as client:
@@ -348,7 +350,7 @@ def test_a_scheduler_that_cannot_be_reached(scenario, tmp_path, impatient, where
     assert left_in(tmp_path) <= {scenario.name}
 
 
-@killed_by("sweep/cluster.py", "if where is self.scheduler:", "if False:")
+@killed_by("uncertainty.sweep.cluster", "if where is self.scheduler:", "if False:")
 @pytest.mark.slow
 def test_a_scheduler_that_is_gone_leaves_nothing_behind(study, alone, inside, tmp_path, impatient):
     """No thread of a client that would block the next one, and no folder that only `resume` would take."""
@@ -360,7 +362,7 @@ def test_a_scheduler_that_is_gone_leaves_nothing_behind(study, alone, inside, tm
 
 
 @pytest.mark.slow
-@killed_by("sweep/cluster.py", "await asyncio.wait_for(call(), TIMEOUT_SECONDS + 1)", "await call()")
+@killed_by("uncertainty.sweep.cluster", "await asyncio.wait_for(call(), TIMEOUT_SECONDS + 1)", "await call()")
 def test_what_listens_but_is_no_scheduler(study, tmp_path, impatient):
     """It never says a word; so that nobody waits for ever if we did, it is gone after a while."""
     with socket.create_server(("127.0.0.1", 0)) as mute:
@@ -405,7 +407,9 @@ def without(folder, name):
     return folder
 
 
-@killed_by("sweep/cluster.py", "_check_worker(get_worker().address, _result_versions(study.engine), versions)", "pass")
+@killed_by(
+    "uncertainty.sweep.cluster", "_check_worker(get_worker().address, _result_versions(study.engine), versions)", "pass"
+)
 def test_a_worker_that_joins_later_has_the_same_versions(study, monkeypatch):
     monkeypatch.setattr(cluster, "get_worker", lambda: SimpleNamespace(address="tcp://late:1"))
     owner = describe_owner(study)
@@ -420,7 +424,9 @@ def test_a_number_of_workers_that_cannot_be():
     assert Dask().workers == core_count()
 
 
-@killed_by("sweep/cluster.py", "for line in describe_differences(worker_versions, own_versions):", "for line in ():")
+@killed_by(
+    "uncertainty.sweep.cluster", "for line in describe_differences(worker_versions, own_versions):", "for line in ():"
+)
 @pytest.mark.slow
 def test_a_worker_with_other_versions(scenario, tmp_path):
     """Of the package and of JAX; and one that has no diffabs at all."""

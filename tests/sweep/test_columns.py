@@ -13,7 +13,7 @@ from sweeping import SCENARIO
 
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import ScenarioError, dump, load, loads
-from diffabs.sweep import Empirical, Results, sample_files
+from diffabs.uncertainty.sweep import Empirical, Results, sample_files
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
@@ -35,7 +35,7 @@ def scenario(file, tmp_path):
     return file(MEASURED)
 
 
-@killed_by("sweep/distributions.py", "return tuple(x / scale for x in value)", "return tuple(value)")
+@killed_by("uncertainty.sweep.distributions", "return tuple(x / scale for x in value)", "return tuple(value)")
 def test_a_file_is_its_numbers(scenario):
     """In the unit of the path, from the folder of the scenario; the dump holds the numbers themselves."""
     chosen = load(scenario)
@@ -74,9 +74,9 @@ def written(folder, text):
     (folder / "day" / "masses.csv").write_text(text)
 
 
-@killed_by("sweep/sample_files.py", "(pa.ArrowException, UnicodeDecodeError)", "pa.ArrowException")
-@killed_by("sweep/sample_files.py", "return read_decimal(value)", "return float(value)")
-@killed_by("sweep/sample_files.py", "decimal.Decimal) else np.nan", "decimal.Decimal) else 0.0")
+@killed_by("uncertainty.sweep.sample_files", "(pa.ArrowException, UnicodeDecodeError)", "pa.ArrowException")
+@killed_by("uncertainty.sweep.sample_files", "return read_decimal(value)", "return float(value)")
+@killed_by("uncertainty.sweep.sample_files", "decimal.Decimal) else np.nan", "decimal.Decimal) else 0.0")
 @pytest.mark.parametrize(
     ("change", "needed"),
     [
@@ -127,7 +127,7 @@ def test_what_is_wrong_with_the_table_is_said(scenario, given, needed):
     assert "\n" not in str(error.value)
 
 
-@killed_by("sweep/sample_files.py", "pa.BufferReader(file.read())", "file")
+@killed_by("uncertainty.sweep.sample_files", "pa.BufferReader(file.read())", "file")
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_no_thread_of_the_reader_holds_a_python_file(suffix, tmp_path, monkeypatch):
     """Such a thread ends the process by an abort if it is alive when Python ends, often with one core."""

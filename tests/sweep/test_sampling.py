@@ -15,12 +15,12 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 from seams import replace_seam
 
-from diffabs.config.values import as_plain
 from diffabs.core.pytree import ParameterSpec
+from diffabs.host.values import as_plain
 from diffabs.scenario.toml import write_toml
-from diffabs.sweep import distributions, sampling
-from diffabs.sweep import variables as space
-from diffabs.sweep.distributions import (
+from diffabs.uncertainty.sweep import distributions, sampling
+from diffabs.uncertainty.sweep import variables as space
+from diffabs.uncertainty.sweep.distributions import (
     Categorical,
     Empirical,
     LogNormal,
@@ -29,8 +29,8 @@ from diffabs.sweep.distributions import (
     Uniform,
     describe_out_of_range,
 )
-from diffabs.sweep.sampling import Corners, Grid, LatinHypercube, Random, Saltelli, Sobol
-from diffabs.sweep.variables import Correlation, Rows, Space
+from diffabs.uncertainty.sweep.sampling import Corners, Grid, LatinHypercube, Random, Saltelli, Sobol
+from diffabs.uncertainty.sweep.variables import Correlation, Rows, Space
 
 MASS = ParameterSpec("kg", 0, open_low=True)
 NUMBERS = "numbers of type float, or texts, are needed"
@@ -83,7 +83,7 @@ def quantile(case, p, q):
 
 
 @killed_by(
-    "sweep/distributions.py",
+    "uncertainty.sweep.distributions",
     "p * width * rise), self.high - np.sqrt(q * width * fall)",
     "p * width * fall), self.high - np.sqrt(q * width * rise)",
 )
@@ -97,7 +97,9 @@ def test_quantiles_are_scipys(case):
     np.testing.assert_allclose(found.ravel(), quantile(case, u, 1 - u), rtol=1e-12, atol=1e-15)
 
 
-@killed_by("sweep/distributions.py", "return self._at(ndtr(z), ndtr(-np.asarray(z)))", "return self.value(ndtr(z))")
+@killed_by(
+    "uncertainty.sweep.distributions", "return self._at(ndtr(z), ndtr(-np.asarray(z)))", "return self.value(ndtr(z))"
+)
 @pytest.mark.parametrize("case", CONTINUOUS)
 def test_both_tails_of_normal_coordinates_keep_their_digits(case):
     """Twelve digits of Phi(7) are nines, those of Phi(-7) are all there."""
@@ -146,7 +148,7 @@ def test_rounding_does_not_leave_the_support(low):
         assert ((values >= low) & (values <= high)).all()
 
 
-@killed_by("sweep/discrete.py", "np.ones(self.size) if self.weights is None", "np.ones(self.size) if True")
+@killed_by("uncertainty.sweep.discrete", "np.ones(self.size) if self.weights is None", "np.ones(self.size) if True")
 def test_choices_come_by_weight():
     """u below F(k), so the edges belong to the next choice; the last includes u = 1."""
     ours = Categorical(("dry", "wet", "snow"), (1.0, 1.0, 2.0))
@@ -190,9 +192,9 @@ def test_draws_are_distributed_as_scipy_says(design):
     assert np.abs(independent).max() < 4.5 / math.sqrt(n)
 
 
-@killed_by("sweep/sampling.py", "numbers = start + jax", "numbers = 0 * start + jax", case="random")
+@killed_by("uncertainty.sweep.sampling", "numbers = start + jax", "numbers = 0 * start + jax", case="random")
 @killed_by(
-    "sweep/sampling.py",
+    "uncertainty.sweep.sampling",
     "_hypercube_points(seed, samples, dimension)[start:stop]",
     "_hypercube_points(seed, stop - start, dimension)",
     case="latin",
@@ -211,7 +213,12 @@ def test_chunks_make_the_whole_bit_for_bit(case):
         np.testing.assert_array_equal(np.concatenate([part[path] for part in parts]), column)
 
 
-@killed_by("sweep/sampling.py", "_random_words(_check_seed(seed)", "_random_words(_check_seed(0 * seed)", case="random")
+@killed_by(
+    "uncertainty.sweep.sampling",
+    "_random_words(_check_seed(seed)",
+    "_random_words(_check_seed(0 * seed)",
+    case="random",
+)
 @pytest.mark.parametrize("case", DESIGNS)
 def test_the_seed_decides(case):
     design, samples = DESIGNS[case]
@@ -249,7 +256,7 @@ def test_draws_do_not_depend_on_precision_and_compile_once():
     assert sampling._random_words._cache_size() == compiled
 
 
-@killed_by("sweep/sampling.py", "spawn_key=(stream,)", "spawn_key=(0 * stream,)")
+@killed_by("uncertainty.sweep.sampling", "spawn_key=(stream,)", "spawn_key=(0 * stream,)")
 def test_sobol_replicates_are_scipys():
     """Generated at once, each with a stream of its own; odd multiples of 2^-33, so never 0."""
     found = Sobol(4).unit(9, 0, 1024, 3, 1024)
@@ -318,7 +325,7 @@ def test_a_grid_is_complete():
     assert Grid(3).unit(0, 2, 4, 2, 9).tolist() == [[0.0, 1.0], [0.5, 0.0]]
 
 
-@killed_by("sweep/sampling.py", "places * (1 / (levels - 1))", "places / levels")
+@killed_by("uncertainty.sweep.sampling", "places * (1 / (levels - 1))", "places / levels")
 def test_a_grid_needs_no_memory_for_its_levels():
     """Those of NumPy, to the bit; and the last of a number that no list could have."""
     for n in (2, 3, 50, 12_345):
@@ -337,7 +344,7 @@ def test_corners_are_complete():
     assert found == list(itertools.product((1.0, 2.0), (-3.0, 3.0), (-1.0, 7.5), (4.0, 8.0)))
 
 
-@killed_by("sweep/sampling.py", "np.where(from_b, b, a)", "np.where(from_b, a, b)")
+@killed_by("uncertainty.sweep.sampling", "np.where(from_b, b, a)", "np.where(from_b, a, b)")
 def test_saltelli_rows_are_a_b_and_mixtures():
     rows, d = 64, 3
     found = Saltelli().unit(6, 0, rows * (d + 2), d, rows * (d + 2)).reshape(rows, d + 2, d)
@@ -362,7 +369,11 @@ def test_saltelli_gives_the_sensitivity_indices_of_ishigami():
     np.testing.assert_allclose(found, [0.3139, 0.4424, 0.0], atol=0.01)
 
 
-@killed_by("sweep/variables.py", "np.linalg.cholesky(np.asarray(self.matrix, float))", "np.asarray(self.matrix, float)")
+@killed_by(
+    "uncertainty.sweep.variables",
+    "np.linalg.cholesky(np.asarray(self.matrix, float))",
+    "np.asarray(self.matrix, float)",
+)
 def test_correlations_are_recovered():
     """Pearson's of normals is rho, Spearman's of any two 6/pi asin(rho/2); the marginals stay what they are."""
     variables = {
@@ -462,7 +473,7 @@ def test_the_table_of_a_space_is_read_back():
     assert space.read_space({"variables": {}}, "sweep").design == Random()
 
 
-@killed_by("sweep/discrete.py", "not all(isinstance(value, str) for value in column)", "False")
+@killed_by("uncertainty.sweep.discrete", "not all(isinstance(value, str) for value in column)", "False")
 @pytest.mark.parametrize(
     ("ours", "lines"),
     [
@@ -674,7 +685,7 @@ def test_what_is_wrong_with_a_space_is_said(ours, line):
     assert "\n" not in str(caught.value)
 
 
-@killed_by("config/values.py", "isinstance(value, numbers.Real)", "isinstance(value, int | float)")
+@killed_by("host.values", "isinstance(value, numbers.Real)", "isinstance(value, int | float)")
 def test_unbounded_variables_may_have_levels_inside():
     ours = Space({"a": Normal(0.0, 1.0)}, None, Grid({"a": (0.25, 0.5, np.float32(0.75))}))
     assert ours.check() == 3
@@ -694,7 +705,9 @@ def test_a_seed_has_32_bits(design, seed):
         design.unit(seed, 0, 4, 1, 4)
 
 
-@killed_by("sweep/distributions.py", "support.high == spec.high and spec.open_high", "False and spec.open_high")
+@killed_by(
+    "uncertainty.sweep.distributions", "support.high == spec.high and spec.open_high", "False and spec.open_high"
+)
 @pytest.mark.parametrize(
     ("ours", "spec", "line"),
     [

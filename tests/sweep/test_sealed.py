@@ -13,7 +13,7 @@ from commands import assert_one_error_line, run
 from mutants import killed_by
 from sweeping import SCENARIO
 
-from diffabs.sweep import Results, SweepError
+from diffabs.uncertainty.sweep import Results, SweepError
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
@@ -65,7 +65,7 @@ def flipped(data, bit):
 
 
 @pytest.mark.slow
-@killed_by("sweep/seal.py", "if chunk_file_name(seal.chunk, data) != path.name:", "if False:")
+@killed_by("uncertainty.sweep.seal", "if chunk_file_name(seal.chunk, data) != path.name:", "if False:")
 @pytest.mark.parametrize("seed", range(4))
 def test_every_flipped_bit_of_a_chunk_is_seen(copy, seed):
     """A hundred of each seed, anywhere in a file: pages, dictionary, footer, marks."""
@@ -89,7 +89,7 @@ def test_compare_sees_it_too(copy, whole):
 
 
 @pytest.mark.slow
-@killed_by("sweep/results.py", "self._verified.get(chunk) == state", "chunk in self._verified")
+@killed_by("uncertainty.sweep.results", "self._verified.get(chunk) == state", "chunk in self._verified")
 def test_a_file_that_changes_while_it_is_open_is_verified_again(copy):
     found, path = Results(copy), chunk_files(copy)[0]
     before = found.column("iae")
@@ -104,7 +104,9 @@ def numbered(path, chunk):
 
 
 @killed_by(
-    "sweep/seal.py", "for key, value in seal.metadata().items()", "for key, value in list(seal.metadata().items())[::2]"
+    "uncertainty.sweep.seal",
+    "for key, value in seal.metadata().items()",
+    "for key, value in list(seal.metadata().items())[::2]",
 )
 def test_chunks_that_exchanged_their_numbers(copy, whole):
     one, two = chunk_files(copy)[1:3]
@@ -125,7 +127,9 @@ def test_a_chunk_that_was_copied(copy, whole):
 
 
 @killed_by(
-    "sweep/seal.py", "for key, value in seal.metadata().items()", "for key, value in list(seal.metadata().items())[1:2]"
+    "uncertainty.sweep.seal",
+    "for key, value in seal.metadata().items()",
+    "for key, value in list(seal.metadata().items())[1:2]",
 )
 def test_a_chunk_of_another_sweep(copy, whole):
     """Not damaged, so it is not removed either: somebody may have no other copy."""
@@ -213,7 +217,7 @@ def test_the_digest_of_a_manifest_is_that_of_the_rest(whole, copy):
 
 
 @pytest.mark.slow
-@killed_by("sweep/manifest.py", 'if document.get("digest") != json_digest(manifest):', "if False:")
+@killed_by("uncertainty.sweep.manifest", 'if document.get("digest") != json_digest(manifest):', "if False:")
 def test_a_scenario_that_was_edited_in_the_manifest_is_seen(copy, whole):
     def heavier(there):
         there["source"]["scenario"] = there["source"]["scenario"].replace("0.0995", "0.1")
@@ -228,7 +232,7 @@ def test_a_scenario_that_was_edited_in_the_manifest_is_seen(copy, whole):
         shutil.copy(whole / "out" / "manifest.json", copy)
 
 
-@killed_by("cli/sweep.py", "    check_owner(folder, manifest, number)\n", "")
+@killed_by("cli.sweep", "    check_owner(folder, manifest, number)\n", "")
 def test_the_manifest_of_another_sweep_is_not_believed(copy, whole):
     """Nor by who reads no number of a chunk."""
     shutil.copy(whole / "other" / "manifest.json", copy)

@@ -25,14 +25,25 @@ from sweeping import described, manifest
 
 import diffabs as d
 from diffabs import roads
-from diffabs.objectives import Effort
+from diffabs.engine.run import measure, rollout
+from diffabs.parts.objectives import Effort
 from diffabs.scenario.defaults import balancing
-from diffabs.simulate.run import measure, rollout
-from diffabs.sweep import Categorical, Local, Normal, Results, Space, Study, SweepError, Uniform, runner, sweep
-from diffabs.sweep.checking import check_accuracy
-from diffabs.sweep.seal import tables_digest
-from diffabs.sweep.store import Store
-from diffabs.sweep.trajectories import write_trajectories
+from diffabs.uncertainty.sweep import (
+    Categorical,
+    Local,
+    Normal,
+    Results,
+    Space,
+    Study,
+    SweepError,
+    Uniform,
+    runner,
+    sweep,
+)
+from diffabs.uncertainty.sweep.checking import check_accuracy
+from diffabs.uncertainty.sweep.seal import tables_digest
+from diffabs.uncertainty.sweep.store import Store
+from diffabs.uncertainty.sweep.trajectories import write_trajectories
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
@@ -100,7 +111,7 @@ def same(found, expected, **tolerance):
 
 
 @pytest.mark.slow
-@killed_by("sweep/runner.py", "noise_key(seed, sample)", "noise_key(seed, 0)")
+@killed_by("uncertainty.sweep.runner", "noise_key(seed, sample)", "noise_key(seed, 0)")
 def test_each_row_is_its_lane_run_by_itself(posed, made):
     assert made.column("sample").tolist() == list(range(150))
     some = np.arange(0, 150, 4)
@@ -139,7 +150,7 @@ def test_diverged_runs_are_counted_and_keep_their_row(study, swept):
     assert np.isfinite(swept.column("iae")[~bad]).all()
 
 
-@killed_by("sweep/study.py", "unit_at(spec.unit, place, np.size(value))", "spec.unit")
+@killed_by("uncertainty.sweep.study", "unit_at(spec.unit, place, np.size(value))", "spec.unit")
 def test_entries_of_lists_have_their_own_units(study, swept):
     """A gain of slip for its integral and itself; of angles and their rates for a balancing robot."""
     known = {"controller.gain.0": "N m/s", "controller.gain.1": "N m", "plant.mass": "kg"}
@@ -168,7 +179,7 @@ def test_worst(swept):
     assert rows.column("overshoot").to_numpy().tolist() == np.sort(values)[::-1][:7].tolist()
 
 
-@killed_by("sweep/results.py", "if name not in available", "if False")
+@killed_by("uncertainty.sweep.results", "if name not in available", "if False")
 @pytest.mark.parametrize(
     ("read", "line"),
     [
@@ -234,7 +245,7 @@ def test_stopped_and_continued_is_the_same_to_the_bit(study, swept, tmp_path):
     assert whole.digest == swept.digest
 
 
-@killed_by("sweep/checking.py", 'np.searchsorted(results.column("sample"), samples)', "samples")
+@killed_by("uncertainty.sweep.checking", 'np.searchsorted(results.column("sample"), samples)', "samples")
 @pytest.mark.slow
 def test_a_half_step_of_a_sweep_with_a_gap(study, swept, tmp_path):
     """Its samples are those of the other chunks, and each change is that of the sample's own row."""
@@ -247,7 +258,7 @@ def test_a_half_step_of_a_sweep_with_a_gap(study, swept, tmp_path):
     assert found["metrics"]["iae"]["largest"] < 1e-3
 
 
-@killed_by("sweep/checking.py", "refine_solver(study.solver, 2)", "study.solver")
+@killed_by("uncertainty.sweep.checking", "refine_solver(study.solver, 2)", "study.solver")
 def test_half_steps_are_made_by_the_sweeps_own_engine_and_program(study, swept, monkeypatch):
     """XLA's program of a run compiles for a minute where the sweep's kernel is there already."""
     asked = []
@@ -270,7 +281,7 @@ def test_half_steps_are_made_by_the_sweeps_own_engine_and_program(study, swept, 
 
 
 @killed_by(
-    "sweep/checking.py",
+    "uncertainty.sweep.checking",
     "for name, numbers in turned.items() if numbers",
     "for name, numbers in turned.items() if not numbers",
 )
@@ -287,7 +298,7 @@ def test_a_half_step_that_turns_never_into_a_number(study, swept):
     assert found["metrics"]["overshoot"]["sample"] == repeated[2]
 
 
-@killed_by("simulate/types.py", "fields if solver.kinks is None else", "fields if True else")
+@killed_by("engine.types", "fields if solver.kinks is None else", "fields if True else")
 def test_steps_on_kinks_are_another_sweep(study, tmp_path):
     """Without a choice the table stays that of older versions, whose sweeps can be continued."""
     entries = {}
@@ -302,7 +313,7 @@ def test_steps_on_kinks_are_another_sweep(study, tmp_path):
             Store(tmp_path).begin(manifest(2, 1, solver=entries[kinks]), resume=True)
 
 
-@killed_by("cli/sweep.py", "report.check_target(out / report.DEFAULT_NAME)", "pass")
+@killed_by("cli.sweep", "report.check_target(out / report.DEFAULT_NAME)", "pass")
 def test_a_report_of_somebody_else_is_left_alone(file, swept, tmp_path):
     folder = shutil.copytree(swept.folder, tmp_path / "out")
     (folder / "report.html").write_text("mine")
@@ -312,7 +323,7 @@ def test_a_report_of_somebody_else_is_left_alone(file, swept, tmp_path):
     assert (folder / "report.html").read_text() == "mine"
 
 
-@killed_by("cli/show_samples.py", "    if scenario.seed:", "    if False:")
+@killed_by("cli.show_samples", "    if scenario.seed:", "    if False:")
 def test_the_seed_of_a_single_run_has_no_effect_and_that_is_said(file, tmp_path):
     changes = ("--set", "solver.seed=5", "--set", "sweep.samples=2", "--set", "sweep.check=0")
     result = run("sweep", file(SMALL), "--out", tmp_path / "out", *changes)
@@ -341,8 +352,8 @@ def test_two_devices_change_no_bit(over_roads, file, tmp_path):
     assert json.loads(done.stdout)["digest"] == over_roads.digest
 
 
-@killed_by("sweep/engines.py", 'study.engine == "kernel" or', "True or")
-@killed_by("sweep/engines.py", 'alone = study.engine == "kernel" or', "alone =")
+@killed_by("uncertainty.sweep.engines", 'study.engine == "kernel" or', "True or")
+@killed_by("uncertainty.sweep.engines", 'alone = study.engine == "kernel" or', "alone =")
 def test_xla_computes_a_chunk_on_each_core(study, swept, tmp_path, monkeypatch):
     """A kernel uses all cores for one chunk. No bit depends on the number of cores."""
     replace_seam(monkeypatch, "chunk_cores", lambda: 3)
@@ -352,7 +363,7 @@ def test_xla_computes_a_chunk_on_each_core(study, swept, tmp_path, monkeypatch):
     assert sweep(study, tmp_path / "out").digest == swept.digest
 
 
-@killed_by("sweep/runner.py", "np.arange(self.size) < len(block.lanes)", "True")
+@killed_by("uncertainty.sweep.runner", "np.arange(self.size) < len(block.lanes)", "True")
 @pytest.mark.parametrize("chunk", [2, 4096])
 def test_copies_that_fill_a_block_do_not_run(study, monkeypatch, chunk):
     """Three samples are three runs, whatever the size of a chunk."""
@@ -480,7 +491,7 @@ def test_the_command_computes_the_table(by_command, swept):
         assert tables_digest([found.table().slice(0, 64)]) == tables_digest([swept.table().slice(0, 64)])
 
 
-@killed_by("cli/main.py", '"seed": setup.sweep.seed', '"seed": setup.seed')
+@killed_by("cli.main", '"seed": setup.sweep.seed', '"seed": setup.seed')
 @pytest.mark.slow
 def test_a_sample_that_is_simulated_again_is_its_row(by_command):
     folder, document, _ = by_command
@@ -554,8 +565,8 @@ def test_a_sweep_without_a_chunk_is_begun_anew(study, tmp_path):
 ORDERED = {"a": 1, "b": 2.0, "c": math.nan}
 
 
-@killed_by("sweep/store.py", "if not lines and list(existing) != list(expected):", "if False:")
-@killed_by("sweep/store.py", "json.dumps(existing) != json.dumps(expected)", "existing != expected")
+@killed_by("uncertainty.sweep.store", "if not lines and list(existing) != list(expected):", "if False:")
+@killed_by("uncertainty.sweep.store", "json.dumps(existing) != json.dumps(expected)", "existing != expected")
 @pytest.mark.parametrize(
     ("other", "line"),
     [
@@ -627,8 +638,8 @@ WRONG = [
 ]
 
 
-@killed_by("sweep/study.py", "isinstance(self.solver, Solver)", "dataclasses.is_dataclass(self.solver)")
-@killed_by("sweep/study.py", "name, bound in self.failure_bounds", "name, bound in self.failures")
+@killed_by("uncertainty.sweep.study", "isinstance(self.solver, Solver)", "dataclasses.is_dataclass(self.solver)")
+@killed_by("uncertainty.sweep.study", "name, bound in self.failure_bounds", "name, bound in self.failures")
 @pytest.mark.parametrize(("changes", "needed"), WRONG, ids=[readable_id(needed) for _, needed in WRONG])
 def test_a_study_that_cannot_be(study, tmp_path, changes, needed):
     with pytest.raises(ValueError, match=re.escape(needed)) as error:
@@ -638,7 +649,7 @@ def test_a_study_that_cannot_be(study, tmp_path, changes, needed):
     assert left_in(tmp_path) == set()
 
 
-@killed_by("sweep/run.py", "    if jax.process_count() > 1:", "    if False:")
+@killed_by("uncertainty.sweep.run", "    if jax.process_count() > 1:", "    if False:")
 def test_several_processes_of_jax_are_refused(study, tmp_path, monkeypatch):
     """Before anything is written."""
     monkeypatch.setattr(jax, "process_count", lambda: 2)
@@ -647,7 +658,7 @@ def test_several_processes_of_jax_are_refused(study, tmp_path, monkeypatch):
     assert left_in(tmp_path) == set()
 
 
-@killed_by("sweep/run.py", 'read_notes(source or {}, "source")', "dict(source or {})")
+@killed_by("uncertainty.sweep.run", 'read_notes(source or {}, "source")', "dict(source or {})")
 @pytest.mark.parametrize(
     ("note", "line"),
     [(1, "source.a = 1 is a number; text is needed"), (Effort, " is of type type; text is needed")],
@@ -655,14 +666,14 @@ def test_several_processes_of_jax_are_refused(study, tmp_path, monkeypatch):
 )
 def test_a_note_that_no_reader_would_take_is_refused_first(study, tmp_path, monkeypatch, note, line):
     """Before a kernel is compiled."""
-    monkeypatch.setattr("diffabs.sweep.run.choose_study_engine", None)
+    monkeypatch.setattr("diffabs.uncertainty.sweep.run.choose_study_engine", None)
     with pytest.raises(ValueError, match=re.escape(line)):
         sweep(study, tmp_path / "out", source={"a": note})
     assert left_in(tmp_path) == set()
 
 
-@killed_by("sweep/study.py", "as_plain(getattr(self, name))", "getattr(self, name)")
-@killed_by("sweep/study.py", "dataclasses.replace(self.solver, **plain_fields(self.solver))", "self.solver")
+@killed_by("uncertainty.sweep.study", "as_plain(getattr(self, name))", "getattr(self, name)")
+@killed_by("uncertainty.sweep.study", "dataclasses.replace(self.solver, **plain_fields(self.solver))", "self.solver")
 def test_a_study_has_a_table_of_plain_values(study):
     failures = {"overshoot": np.float32(0.5)}
     solver = d.FixedStep(jnp.asarray(2e-3), np.float32(0.25))
@@ -684,9 +695,9 @@ def refuse_later(store, *chunks):
         raise RuntimeError("no device answers")
 
 
-@killed_by("sweep/store.py", "        except Exception:\n", "        except ValueError:\n")
-@killed_by("sweep/store.py", "                self._remove_new(before, created)", "                pass")
-@killed_by("sweep/store.py", "self.chunks.rmdir()", "pass")
+@killed_by("uncertainty.sweep.store", "        except Exception:\n", "        except ValueError:\n")
+@killed_by("uncertainty.sweep.store", "                self._remove_new(before, created)", "                pass")
+@killed_by("uncertainty.sweep.store", "self.chunks.rmdir()", "pass")
 @pytest.mark.parametrize("there", [None, {}, {"notes.tmp": "mine"}])
 def test_a_refused_sweep_leaves_a_folder_as_it_was(tmp_path, there):
     store = Store(tmp_path / "out" / "sweep")
@@ -700,7 +711,7 @@ def test_a_refused_sweep_leaves_a_folder_as_it_was(tmp_path, there):
     assert there is None or left_in(store.folder) == set(there)
 
 
-@killed_by("sweep/store.py", "if not self._has_chunks()", "if True")
+@killed_by("uncertainty.sweep.store", "if not self._has_chunks()", "if True")
 def test_a_finished_chunk_stays_when_a_sweep_ends_with_an_error(tmp_path):
     store = Store(tmp_path / "out")
     store.chunks.mkdir(parents=True)  # by a process that was killed before it wrote the manifest

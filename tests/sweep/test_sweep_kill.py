@@ -22,10 +22,10 @@ from commands import assert_one_error_line, left_in, run
 from marks import readable_id
 from sweeping import PATIENCE, SCENARIO, chunks, command, environment, manifest, started, until
 
-from diffabs.sweep import Results
-from diffabs.sweep.manifest import Seals, encode_manifest
-from diffabs.sweep.seal import CHUNK_NAME_PATTERN, encode_chunk
-from diffabs.sweep.store import Store
+from diffabs.uncertainty.sweep import Results
+from diffabs.uncertainty.sweep.manifest import Seals, encode_manifest
+from diffabs.uncertainty.sweep.seal import CHUNK_NAME_PATTERN, encode_chunk
+from diffabs.uncertainty.sweep.store import Store
 
 pytestmark = pytest.mark.slow  # each computes sweeps; what is wrong with one chunk is also seen in test_sealed
 
@@ -127,7 +127,7 @@ def test_killed_again_and_again(longer, tmp_path, kills):
 
 WRITING = """
 import json, os, pathlib, signal, sys
-from diffabs.sweep.store import Store
+from diffabs.uncertainty.sweep.store import Store
 
 folder, manifest, *data = sys.argv[1:]
 

@@ -10,9 +10,9 @@ from mutants import killed_by
 from scipy import optimize, stats
 from seams import replace_seam
 
-from diffabs.sweep.statistics import estimates, paired, sensitivity
-from diffabs.sweep.statistics.estimates import Count, Moments, Tail
-from diffabs.sweep.statistics.replicated import Replicates
+from diffabs.uncertainty.sweep.statistics import estimates, paired, sensitivity
+from diffabs.uncertainty.sweep.statistics.estimates import Count, Moments, Tail
+from diffabs.uncertainty.sweep.statistics.replicated import Replicates
 
 REPETITIONS = 1000
 
@@ -86,7 +86,7 @@ class TestMoments:
         theirs = stats.ttest_1samp(x, 0.0).confidence_interval(0.9)
         np.testing.assert_allclose(ends(Moments.of(x).mean(confidence=0.9)), theirs, rtol=1e-9, atol=0)
 
-    @killed_by("sweep/statistics/estimates.py", "skewness / (6 * n)", "skewness / (3 * n)")
+    @killed_by("uncertainty.sweep.statistics.estimates", "skewness / (6 * n)", "skewness / (3 * n)")
     @pytest.mark.parametrize("sign", [1, -1])
     @pytest.mark.parametrize("n", [2, 3, 10, 1000])
     def test_the_mean_has_the_wider_ends_of_the_t_test_and_of_hall(self, n, sign):
@@ -107,7 +107,9 @@ class TestMoments:
 
 
 class TestCount:
-    @killed_by("sweep/statistics/estimates.py", "stats.beta.ppf(top, k + 1, n - k)", "stats.beta.ppf(top, k, n - k)")
+    @killed_by(
+        "uncertainty.sweep.statistics.estimates", "stats.beta.ppf(top, k + 1, n - k)", "stats.beta.ppf(top, k, n - k)"
+    )
     @pytest.mark.parametrize(("k", "n"), [(0, 10), (10, 10), (3, 10), (1, 1000), (420, 1000)])
     def test_is_clopper_and_pearsons(self, k, n):
         theirs = stats.binomtest(k, n).proportion_ci(0.99)
@@ -122,7 +124,7 @@ class TestCount:
 
 class TestQuantile:
     @killed_by(
-        "sweep/statistics/estimates.py",
+        "uncertainty.sweep.statistics.estimates",
         "stats.binom.isf(1 - top, n, level)) + 1",
         "stats.binom.isf(1 - top, n, level))",
     )
@@ -161,7 +163,7 @@ class TestCVaR:
         )
 
     @killed_by(
-        "sweep/statistics/estimates.py",
+        "uncertainty.sweep.statistics.estimates",
         "tail_weights = np.clip(share - (reached - weights), 0.0, weights)",
         "tail_weights = np.clip(np.round(share) - (reached - weights), 0.0, weights)",
     )
@@ -169,7 +171,7 @@ class TestCVaR:
         assert estimates.cvar([1.0, 5.0, 2.0, 3.0], 0.625).value == pytest.approx((5 + 0.5 * 3) / 1.5, rel=1e-12)
 
     @killed_by(
-        "sweep/statistics/estimates.py",
+        "uncertainty.sweep.statistics.estimates",
         "totals = random.binomial(n, total / n, size=replicates)",
         "totals = np.full(replicates, total)",
     )
@@ -257,13 +259,15 @@ class TestReplicates:
         """Means of the replicates."""
         return [values[r == self.PLACES].mean() for r in range(8)]
 
-    @killed_by("sweep/statistics/replicated.py", " / (1 - np.square(shares).sum())", "")
+    @killed_by("uncertainty.sweep.statistics.replicated", " / (1 - np.square(shares).sum())", "")
     def test_the_mean_has_the_t_interval_of_the_replicates(self):
         theirs = stats.ttest_1samp(self.blocks(self.X), 0.0).confidence_interval(0.9)
         found = self.BY.mean(self.X)
         np.testing.assert_allclose([found.value, *ends(found)], [self.X.mean(), *theirs], rtol=1e-12, atol=0)
 
-    @killed_by("sweep/statistics/replicated.py", "x - x.mean(), self.count) / len(x)", "x, self.count) / len(x)")
+    @killed_by(
+        "uncertainty.sweep.statistics.replicated", "x - x.mean(), self.count) / len(x)", "x, self.count) / len(x)"
+    )
     def test_replicates_of_different_lengths_count_by_their_samples(self):
         """Linearised ratio of two sums, by the replicates left out in turn (jackknife)."""
         kept = np.random.default_rng(42).random(640) < np.linspace(1.0, 0.5, 8)[self.PLACES]
@@ -274,7 +278,7 @@ class TestReplicates:
         half = stats.t.ppf(0.95, 7) * jackknife
         np.testing.assert_allclose(ends(found), [x.mean() - half, x.mean() + half], rtol=0, atol=0.05 * half)
 
-    @killed_by("sweep/statistics/replicated.py", "np.square(shares).sum()", "1 / self.count")
+    @killed_by("uncertainty.sweep.statistics.replicated", "np.square(shares).sum()", "1 / self.count")
     def test_the_error_of_unequal_replicates_is_not_too_small(self):
         """Of independent samples, its square is 1/n on average."""
         random, by = np.random.default_rng(43), Replicates(np.arange(200) // 180, 2)
@@ -282,8 +286,8 @@ class TestReplicates:
         errors = np.array([one.high - one.value for one in found]) / stats.t.ppf(0.975, 1)
         assert np.square(errors).mean() == pytest.approx(1 / 200, rel=0.15)
 
-    @killed_by("sweep/statistics/replicated.py", "n * (level + above)", "n * level")
-    @killed_by("sweep/statistics/replicated.py", "n * (level - below)", "n * level")
+    @killed_by("uncertainty.sweep.statistics.replicated", "n * (level + above)", "n * level")
+    @killed_by("uncertainty.sweep.statistics.replicated", "n * (level - below)", "n * level")
     @pytest.mark.parametrize("level", [0.05, 0.5, 0.9])
     def test_a_quantile_lies_where_the_shares_below_it_allow(self, level):
         x, ordered = self.X, np.sort(self.X)
@@ -298,7 +302,11 @@ class TestReplicates:
         assert self.BY.quantile(x, 0.15)[:3] == (0.0, 0.0, 0.0)
         assert ends(self.BY.quantile(x, stats.expon.cdf(1 / 3))) == [0.0, 1.0]
 
-    @killed_by("sweep/statistics/replicated.py", "np.maximum(x - edge, 0.0) / (1 - level)", "np.maximum(x - edge, 0.0)")
+    @killed_by(
+        "uncertainty.sweep.statistics.replicated",
+        "np.maximum(x - edge, 0.0) / (1 - level)",
+        "np.maximum(x - edge, 0.0)",
+    )
     @pytest.mark.parametrize("level", [0.3, 0.9, 0.951])
     def test_cvar_is_rockafellar_and_uryasevs(self, level):
         x, edge = self.X, np.sort(self.X)[math.ceil(640 * level) - 1]
@@ -309,8 +317,8 @@ class TestReplicates:
         assert found.value == pytest.approx(brute_cvar(x, level)[0], rel=1e-12)
         np.testing.assert_allclose(ends(found), theirs, rtol=1e-12, atol=0)
 
-    @killed_by("sweep/statistics/replicated.py", "MIN_TAIL_SAMPLES <= failures", "1 <= failures")
-    @killed_by("sweep/statistics/replicated.py", "if equal or", "if half == 0 or", case="three each")
+    @killed_by("uncertainty.sweep.statistics.replicated", "MIN_TAIL_SAMPLES <= failures", "1 <= failures")
+    @killed_by("uncertainty.sweep.statistics.replicated", "if equal or", "if half == 0 or", case="three each")
     @pytest.mark.parametrize(
         ("failed", "n"),
         [([], 1024), ([5], 1024), ([5, 6], 1024), (range(0, 1024, 64), 1024), (np.arange(1000) % 100 < 3, 1000)],
@@ -324,7 +332,7 @@ class TestReplicates:
         found = Replicates(np.arange(n) // size, n // size).probability(mask)
         np.testing.assert_allclose(ends(found), theirs, rtol=0, atol=1e-8)
 
-    @killed_by("sweep/statistics/replicated.py", "max(share - half, 0.0)", "share - half")
+    @killed_by("uncertainty.sweep.statistics.replicated", "max(share - half, 0.0)", "share - half")
     def test_a_probability_lies_between_0_and_1(self):
         """All failures in one replicate: the t interval would begin below 0."""
         mask = np.arange(1024) < 40
@@ -335,7 +343,9 @@ class TestReplicates:
         np.testing.assert_allclose(found[:3], [40 / 1024, 0.0, 40 / 1024 + half], rtol=1e-12, atol=0)
         assert Replicates(np.arange(1024) // 64, 16).probability(~mask).high == 1.0
 
-    @killed_by("sweep/statistics/replicated.py", "minlength=self.count).min() == 0", "minlength=self.count).min() < 0")
+    @killed_by(
+        "uncertainty.sweep.statistics.replicated", "minlength=self.count).min() == 0", "minlength=self.count).min() < 0"
+    )
     def test_without_a_replicate_no_interval_is_known(self):
         x, by = self.X[self.PLACES < 7], Replicates(self.PLACES[self.PLACES < 7], 8)
         for found, value in (
@@ -362,8 +372,8 @@ class TestCorrelations:
         theirs = [stats.pearsonr(x, self.Y).statistic for x in self.X.T]
         np.testing.assert_allclose([one.value for one in found], theirs, rtol=1e-12, atol=0)
 
-    @killed_by("sweep/statistics/sensitivity.py", "_influence(u, v, r) + rank_effect", "_influence(u, v, r)")
-    @killed_by("sweep/statistics/sensitivity.py", "u * v - r * (u * u + v * v) / 2", "u * v")
+    @killed_by("uncertainty.sweep.statistics.sensitivity", "_influence(u, v, r) + rank_effect", "_influence(u, v, r)")
+    @killed_by("uncertainty.sweep.statistics.sensitivity", "u * v - r * (u * u + v * v) / 2", "u * v")
     @pytest.mark.parametrize(("kind", "theirs"), [("pearson", stats.pearsonr), ("spearman", stats.spearmanr)])
     def test_the_intervals_are_those_of_samples_left_out(self, kind, theirs):
         """Jackknife of the inverse hyperbolic tangent, for three laws that are not binormal."""
@@ -450,7 +460,7 @@ class TestSobol:
             hits += [one.low <= index <= one.high for one, index in each]
         np.testing.assert_allclose(hits / 2, 95.0, rtol=0, atol=4.0)
 
-    @killed_by("sweep/statistics/sensitivity.py", "mean = (a.mean() + b.mean()) / 2", "mean = b.mean()")
+    @killed_by("uncertainty.sweep.statistics.sensitivity", "mean = (a.mean() + b.mean()) / 2", "mean = b.mean()")
     def test_the_bootstrap_is_that_of_scipy_with_rows_together(self):
         """First and total index. 2,000 resamples on both sides: an end has a standard error of 0.06 deviations."""
         a, b, ab = outputs(ishigami, 3, 200, np.random.default_rng(15))
@@ -499,7 +509,7 @@ class TestPaired:
     NOISE = np.round(np.random.default_rng(20).normal(0.0, 0.5, size=75), 1)
     B = A + (0.3 + np.concatenate([NOISE, -NOISE]))  # differences without skewness: the interval is Student's
 
-    @killed_by("sweep/statistics/paired.py", "difference = first - second", "difference = second - first")
+    @killed_by("uncertainty.sweep.statistics.paired", "difference = first - second", "difference = second - first")
     def test_is_scipys_each_by_each(self):
         found = paired.compare_pairs(self.A, self.B, confidence=0.9)
         theirs = stats.ttest_rel(self.A, self.B).confidence_interval(0.9)
@@ -600,7 +610,7 @@ class TestCoverage:
         found = coverage(lambda k: every[k], lambda: random.binomial(n, p), p)
         assert abs(found - exact) < 2
 
-    @killed_by("sweep/statistics/sensitivity.py", " or n < MIN_CORRELATED_SAMPLES", "")
+    @killed_by("uncertainty.sweep.statistics.sensitivity", " or n < MIN_CORRELATED_SAMPLES", "")
     @pytest.mark.parametrize("n", [4, 9, 10])
     def test_correlations_of_few_samples(self, n):
         """Pearson's of 10 cover 90 %; fewer have no interval."""
@@ -653,7 +663,9 @@ class TestCoverage:
         assert abs(found - 95) < 2
 
     @killed_by(
-        "sweep/statistics/replicated.py", "value = len(x), np.quantile(ordered, level)", "value = len(x), ordered[-1]"
+        "uncertainty.sweep.statistics.replicated",
+        "value = len(x), np.quantile(ordered, level)",
+        "value = len(x), ordered[-1]",
     )
     @pytest.mark.parametrize(
         "law", [stats.uniform(), stats.expon(), stats.norm()], ids=["uniform", "exponential", "normal"]
@@ -673,8 +685,10 @@ class TestCoverage:
         assert coverage(lambda x: by.probability(x > law.isf(0.05)), draw, 0.05, 200) >= 92
 
 
-@killed_by("sweep/statistics/sensitivity.py", "if not varies(np.concatenate([fa, fb])):", "if False:")
-@killed_by("sweep/statistics/sensitivity.py", "outputs if varies(outputs) else np.zeros_like(outputs)", "outputs")
+@killed_by("uncertainty.sweep.statistics.sensitivity", "if not varies(np.concatenate([fa, fb])):", "if False:")
+@killed_by(
+    "uncertainty.sweep.statistics.sensitivity", "outputs if varies(outputs) else np.zeros_like(outputs)", "outputs"
+)
 def test_rounding_has_no_sensitivities():
     """The error of a settled loop is a difference of numbers near 1: a few multiples of 2^-53."""
     random = np.random.default_rng(5)

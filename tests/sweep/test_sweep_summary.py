@@ -7,12 +7,12 @@ from mutants import killed_by
 from scipy import stats
 from sweeping import manifest
 
-from diffabs.sweep import Results
-from diffabs.sweep.manifest import Seals
-from diffabs.sweep.sampling import Saltelli
-from diffabs.sweep.seal import encode_chunk
-from diffabs.sweep.statistics.summary import summarise_sweep
-from diffabs.sweep.store import Store
+from diffabs.uncertainty.sweep import Results
+from diffabs.uncertainty.sweep.manifest import Seals
+from diffabs.uncertainty.sweep.sampling import Saltelli
+from diffabs.uncertainty.sweep.seal import encode_chunk
+from diffabs.uncertainty.sweep.statistics.summary import summarise_sweep
+from diffabs.uncertainty.sweep.store import Store
 
 N, BLOCK = 1024, 64
 
@@ -42,7 +42,9 @@ def in_blocks(made, metric, **flags):
 
 
 @killed_by(
-    "sweep/statistics/summary.py", 'samples // (results.study["samples"] // count), count', "samples % count, count"
+    "uncertainty.sweep.statistics.summary",
+    'samples // (results.study["samples"] // count), count',
+    "samples % count, count",
 )
 def test_a_replicate_is_a_block_of_samples(made):
     """Blocks of one value each: their spread is that of 16 values, whatever is in a block."""
@@ -79,7 +81,9 @@ def of_groups(made, metric, **options):
     return made({"type": "saltelli"}, {"a": POINTS[:, 0], "b": POINTS[:, 1]}, metric, **options)
 
 
-@killed_by("sweep/statistics/rows.py", "self.samples[good] // self.period", "np.flatnonzero(good) // self.period")
+@killed_by(
+    "uncertainty.sweep.statistics.rows", "self.samples[good] // self.period", "np.flatnonzero(good) // self.period"
+)
 @pytest.mark.parametrize(
     ("missing", "lost", "groups"),
     [((), (), 250), ((2,), (), 218), ((2,), (5, 6, 999), 216)],
@@ -98,7 +102,9 @@ def test_indices_are_of_whole_groups(made, missing, lost, groups):
 
 
 @killed_by(
-    "sweep/statistics/rows.py", "self.samples % self.period == 0", "np.arange(len(self.samples)) % self.period == 0"
+    "uncertainty.sweep.statistics.rows",
+    "self.samples % self.period == 0",
+    "np.arange(len(self.samples)) % self.period == 0",
 )
 def test_failures_are_of_the_runs_a(made):
     """Chunks of 126 samples, no multiple of 4: after a gap the first row is not a run A."""

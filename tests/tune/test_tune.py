@@ -38,7 +38,7 @@ class TestSpace:
             assert low <= value <= high
             np.testing.assert_allclose(m.place(float(m.value(m.place(start)))), m.place(start), rtol=1e-12, atol=1e-12)
 
-    @killed_by("core/bijectors.py", "if far / near >= LOGARITHMIC_RATIO:", "if False:")
+    @killed_by("core.bijectors", "if far / near >= LOGARITHMIC_RATIO:", "if False:")
     def test_a_range_of_decades_is_searched_in_its_logarithm(self):
         assert isinstance(bijection(1e-3, 1e-1, 1e-2), Decades)
         assert isinstance(bijection(-1e4, -10.0, -100.0), Decades)
@@ -98,7 +98,7 @@ class TestSpace:
 class TestAggregates:
     VALUES = np.array(jax.random.normal(jax.random.key(3), (37,))) + 4.0
 
-    @killed_by("tune/risk.py", "weights * -jnp.sort(-values)", "weights * jnp.sort(values)")
+    @killed_by("tune.risk", "weights * -jnp.sort(-values)", "weights * jnp.sort(values)")
     @pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 0.95, 0.99])
     def test_cvar_is_rockafellar_and_uryasevs_minimum(self, level):
         def formula(t):
@@ -119,7 +119,7 @@ class TestAggregates:
         np.testing.assert_allclose(soft, self.VALUES.mean(), rtol=1e-3)
         assert soft < SmoothWorst(softness=0.1)(x) < sharp
 
-    @killed_by("tune/risk.py", "jnp.where(size > 0, size, 1.0)", "jnp.maximum(size, 1e-300)")
+    @killed_by("tune.risk", "jnp.where(size > 0, size, 1.0)", "jnp.maximum(size, 1e-300)")
     def test_the_smooth_worst_of_zeros_in_single_precision(self):
         value, slope = jax.value_and_grad(SmoothWorst())(jnp.zeros(3, jnp.float32))
         assert value == 0
@@ -185,7 +185,7 @@ class TestDescent:
         np.testing.assert_allclose(lane.z, [1.0, -2.0], rtol=0, atol=1e-4)
 
     @killed_by(
-        "tune/descent.py",
+        "tune.descent",
         "elif float(evaluation.gradient @ descent_state.update) < WOLFE_FRACTION * slope and not longest:",
         "elif False:",
     )
@@ -199,7 +199,7 @@ class TestDescent:
         assert f(lane.z) <= f(start) + 1e-4 * before @ step
         assert after @ step >= 0.9 * (before @ step)
 
-    @killed_by("tune/descent.py", "if descent_state.jumps >= MAX_JUMPS:", "if False:")
+    @killed_by("tune.descent", "if descent_state.jumps >= MAX_JUMPS:", "if False:")
     def test_where_the_loss_jumps_it_ends_soon(self):
         """A wall at z0 = 0.3, which the slope points across: twelve trials, twice."""
         (lane,) = descend(lambda z: z[0] + z[1] ** 2 + jnp.where(z[0] < 0.3, 1e3, 0.0), [0.7, 1.0])
@@ -214,7 +214,7 @@ class TestDescent:
         slope = jax.grad(lambda x: (x - 0.99) ** 2 - 1e-3 * jnp.sqrt(1 - x))
         assert float(jnp.max(jnp.abs(jax.vmap(slope)(jnp.asarray(lane.z))))) < 1e-5
 
-    @killed_by("tune/descent.py", "return evaluation, usable & self.steady(z)", "return evaluation, usable")
+    @killed_by("tune.descent", "return evaluation, usable & self.steady(z)", "return evaluation, usable")
     def test_what_is_not_stable_is_not_entered(self):
         steady = lambda z: z[:, 0] > 0.5  # noqa: E731
         (lane,) = descend(lambda z: jnp.sum(z**2), [2.0, 1.0], steady=steady)
@@ -255,10 +255,8 @@ class TestDescent:
 class TestFlatEnds:
     """x = s(z) in (0, 1), and the minimum at x = 0.7."""
 
-    @killed_by(
-        "tune/descent.py", "gradient = np.where(gradient * z > 0, gradient", "gradient = np.where(False, gradient"
-    )
-    @killed_by("tune/descent.py", "update = np.where(leaves & ", "update = np.where(False & ")
+    @killed_by("tune.descent", "gradient = np.where(gradient * z > 0, gradient", "gradient = np.where(False, gradient")
+    @killed_by("tune.descent", "update = np.where(leaves & ", "update = np.where(False & ")
     @pytest.mark.parametrize("share", [1e-2, 1e-4, 1e-6, 1e-8, 1 - 1e-8])
     def test_a_start_at_a_flat_end_leaves_it(self, share):
         interval = Interval(0.0, 1.0)
@@ -337,10 +335,8 @@ class TestConstraints:
         assert found.met
         assert found.violation[1] == 0
 
-    @killed_by("tune/augmented_lagrangian.py", "np.full(count, self.method.margin)", "np.zeros(count)")
-    @killed_by(
-        "tune/augmented_lagrangian.py", "_raise_penalty(_raise_multipliers(m, descent_states)", "_raise_penalty(m"
-    )
+    @killed_by("tune.augmented_lagrangian", "np.full(count, self.method.margin)", "np.zeros(count)")
+    @killed_by("tune.augmented_lagrangian", "_raise_penalty(_raise_multipliers(m, descent_states)", "_raise_penalty(m")
     @pytest.mark.parametrize("start", [(2.0, 2.0), (0.1, 0.1), (0.7, 0.7)])
     def test_what_is_met_is_met_without_a_tolerance(self, start):
         """Multipliers come to a bound from outside; the bound stated, not one beside it, holds where they end. With the
@@ -352,7 +348,7 @@ class TestConstraints:
         assert found.values["x"] + found.values["y"] >= 1
         assert found.objective[1] == pytest.approx(2 / 3, rel=5e-3)  # a margin of 1e-3 costs 2e-3 of it
 
-    @killed_by("tune/augmented_lagrangian.py", "(bool(is_settled) and descent_state", "(descent_state")
+    @killed_by("tune.augmented_lagrangian", "(bool(is_settled) and descent_state", "(descent_state")
     @pytest.mark.parametrize("start", [10.0, 2.33, 1.0])
     def test_it_goes_on_beyond_the_first_feasible_round(self, start):
         """x' = k (1 - x) - x for 2 s: the least integral of 1 - x with x(2) <= 0.7, from both sides of the bound."""
@@ -372,7 +368,7 @@ class TestConstraints:
         found = AugmentedLagrangianSearch(problem, Method(rounds=1, margin=1e-6), None).result()
         assert found.reason in (Reason.LIMIT, Reason.KEPT)
 
-    @killed_by("tune/descent.py", "        if worst <= 0:", "        if False:")
+    @killed_by("tune.descent", "        if worst <= 0:", "        if False:")
     def test_a_feasible_iterate_is_returned_for_an_infeasible_end(self):
         """Two iterations and no multipliers raised: from inside, the penalty alone ends outside of the bound."""
         problem = Constrained([1.0, 1.0], lambda z: jnp.array([1 - z[0] - z[1]]))

@@ -4,17 +4,17 @@ import sliding
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.controllers import PID
 from diffabs.core.loop import Loop
-from diffabs.objectives import IAE
-from diffabs.references import Setpoint
-from diffabs.stops import NoStop
+from diffabs.parts.controllers import PID
+from diffabs.parts.objectives import IAE
+from diffabs.parts.references import Setpoint
+from diffabs.parts.stops import NoStop
 from diffabs.tune import Reason, build_problem, tune
 
 END = 3.0
 
 
-@killed_by("tune/descent.py", "bool(evaluation.evaluation.slid > 0)", "False")
+@killed_by("tune.descent", "bool(evaluation.evaluation.slid > 0)", "False")
 def test_a_search_ends_beside_sliding_runs():
     """A block with speed 1 and dry friction F is at rest from t = 1/F on, so a run slides if F > 1/END.
 

@@ -16,16 +16,16 @@ import diffabs as d
 from diffabs import actuators, controllers, plants, references
 from diffabs.core.pytree import canonical_dtypes, param, pytree
 from diffabs.core.validity import find_problems
-from diffabs.design.polytopes import Polytope
-from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
+from diffabs.engine.stability import stable_step, stable_steps
 from diffabs.linear.slip_model import Sampling, SlipModel
-from diffabs.objectives import BRAKING
-from diffabs.objectives.balance import PeakTorque
-from diffabs.objectives.tracking import FinalValue
+from diffabs.parts.objectives import BRAKING
+from diffabs.parts.objectives.balance import PeakTorque
+from diffabs.parts.objectives.tracking import FinalValue
+from diffabs.parts.stops import SpeedReached
+from diffabs.robust.design.polytopes import Polytope
+from diffabs.robust.design.speed_scaled import SpeedScaled, greatest_speed_fall
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.section_tune import Goal
-from diffabs.simulate.stability import stable_step, stable_steps
-from diffabs.stops import SpeedReached
 from diffabs.tune import (
     AtMost,
     CertifiedDecay,
@@ -145,12 +145,12 @@ def test_a_start_that_is_not_stable_is_refused():
         tune(build_problem(RIG, free=GAINS, objective={"iae": 1.0}, solver=d.FixedStep(0.1, 0.3)))
 
 
-@killed_by("tune/tuning.py", 'check_part(aggregate or Mean(), "aggregate.")', "aggregate or Mean()")
-@killed_by("tune/tuning.py", "    _check_not_overwritten(subject, free_space, batch)\n", "")
-@killed_by("tune/tuning.py", "if not listed or not all(", "if not all(")
-@killed_by("tune/tuning.py", " and not isinstance(constraints, Mapping | str)", "")
+@killed_by("tune.tuning", 'check_part(aggregate or Mean(), "aggregate.")', "aggregate or Mean()")
+@killed_by("tune.tuning", "    _check_not_overwritten(subject, free_space, batch)\n", "")
+@killed_by("tune.tuning", "if not listed or not all(", "if not all(")
+@killed_by("tune.tuning", " and not isinstance(constraints, Mapping | str)", "")
 @killed_by(
-    "tune/tuning.py",
+    "tune.tuning",
     'getattr(requirement, "metric", None)',
     'requirement.metric if type(requirement).__name__ == "AtMost" else None',
 )
@@ -196,14 +196,14 @@ def test_says_what_does_not_fit(change, message):
         tune(build_problem(RIG, **given | change))
 
 
-@killed_by("tune/tuning.py", "constraints = _check_constraints(", "_check_constraints(")
+@killed_by("tune.tuning", "constraints = _check_constraints(", "_check_constraints(")
 def test_constraints_may_come_from_a_generator():
     bounds = (AtMost(name, 0.5) for name in ("iae", "overshoot"))
     problem = build_problem(RIG, free=GAINS, objective={"iae": 1.0}, over=TWO, solver=SOLVER, constraints=bounds)
     assert problem.excesses == 2 * 2  # of each of two runs
 
 
-@killed_by("core/tracing.py", "[True] * len(program.outvars)", "[False] * len(program.outvars)", case="log_diagonal")
+@killed_by("core.tracing", "[True] * len(program.outvars)", "[False] * len(program.outvars)", case="log_diagonal")
 @pytest.mark.parametrize(
     ("free", "over", "idle"),
     [
@@ -225,14 +225,14 @@ def test_a_free_parameter_is_not_overwritten(free, over, idle):
         build_problem(loop, **given)
 
 
-@killed_by("scenario/section_tune.py", "if both := set(self.free) & set(self.over):", "if both := set():")
+@killed_by("scenario.section_tune", "if both := set(self.free) & set(self.over):", "if both := set():")
 def test_a_section_frees_no_parameter_of_its_lanes():
     goal = Goal(free={"plant.mass": (4.0, 8.0)}, objective={"iae": 1.0}, over={"plant.mass": (5.3, 6.2)})
     with pytest.raises(ValueError, match=r"^plant.mass: both in tune.free and in tune.over; leave it out of one"):
         goal.check(RIG)
 
 
-@killed_by("tune/augmented_lagrangian.py", "for name in (*self.problem.weights, *bounds):", "for name in ():")
+@killed_by("tune.augmented_lagrangian", "for name in (*self.problem.weights, *bounds):", "for name in ():")
 @pytest.mark.slow
 @pytest.mark.parametrize("where", ["constraint", "objective"])
 def test_a_metric_that_is_infinite_at_the_start_is_named(where):
@@ -256,9 +256,7 @@ class Margin(FinalValue):
         return jnp.log(-ending.sample.output.distance - 1.0)
 
 
-@killed_by(
-    "tune/augmented_lagrangian.py", "np.count_nonzero(value == unreached)", "np.count_nonzero(~np.isfinite(value))"
-)
+@killed_by("tune.augmented_lagrangian", "np.count_nonzero(value == unreached)", "np.count_nonzero(~np.isfinite(value))")
 @pytest.mark.slow
 @pytest.mark.parametrize("where", ["constraint", "objective"])
 def test_a_nan_metric_at_the_start_does_not_settle_late(where):
@@ -307,12 +305,12 @@ class TestStability:
         np.testing.assert_allclose(stable_steps(batch), each, rtol=1e-12)
 
     @killed_by(
-        "simulate/stability.py",
+        "engine.stability",
         "angles = np.abs(np.angle(direction))",
         "angles = np.full(np.shape(direction), np.pi)",
     )
     def test_the_limit_of_a_real_and_of_an_imaginary_mode(self):
-        from diffabs.simulate.stability import _radius
+        from diffabs.engine.stability import _radius
 
         np.testing.assert_allclose(_radius(np.array([-1.0 + 0j])), 2.785, atol=1.5e-3)  # the roots of |R(z)| = 1
         np.testing.assert_allclose(_radius(np.array([1j])), np.sqrt(8.0), atol=1.5e-3)
@@ -331,7 +329,7 @@ class TestPoles:
         np.testing.assert_allclose(np.sort(rates), np.sort(1 + np.array([-2, -2, -5, -1]) / 1.5), rtol=1e-12)
         np.testing.assert_allclose(np.sort(damping), np.sort([0.6 - 2 / 13**0.5] * 2 + [-0.4] * 2), rtol=1e-9)
 
-    @killed_by("tune/constraints.py", "(abs(self.decay) or 1.0)", "(self.decay or 1.0)")
+    @killed_by("tune.constraints", "(abs(self.decay) or 1.0)", "(self.decay or 1.0)")
     def test_a_bound_on_growth(self):
         """Growth of at most 2/s: the poles -2, -2, -5 and -1 hold it, and one of +3 does not."""
         names = ("integral of slip error", "slip error")
@@ -342,7 +340,7 @@ class TestPoles:
             excess = Poles(system, decay=-2.0).excess(self.loop_for(np.array([-1.0, -2.0])), {})
             np.testing.assert_allclose(np.sort(excess), np.sort((np.array(real) - 2.0) / 2), rtol=1e-12)
 
-    @killed_by("tune/constraints.py", "if self.system.period is not None:", "if False:")
+    @killed_by("tune.constraints", "if self.system.period is not None:", "if False:")
     def test_discrete_poles_are_those_of_continuous_time(self):
         from scipy.linalg import expm
 
@@ -398,7 +396,7 @@ class TestCertifiedDecay:
 
 class TestWeights:
     @pytest.mark.slow
-    @killed_by("tune/weights.py", "root = root + jnp.diag(diagonal)", "root = jnp.diag(diagonal)")
+    @killed_by("tune.weights", "root = root + jnp.diag(diagonal)", "root = jnp.diag(diagonal)")
     def test_the_gain_is_that_of_the_riccati_equation(self):
         model = SlipModel(speed=20 / 3.6)
         q = np.array([[1e6, 2e3], [2e3, 1e4]])
@@ -429,11 +427,11 @@ class TestWeights:
             lq_weights(RIG, q, r, lqr_gain_design(SlipModel()))
 
     @killed_by(
-        "tune/weights.py",
+        "tune.weights",
         'log_diagonal: Vector = param(default=(0.0, 0.0), unit="1", free=True)',
         'log_diagonal: Vector = param(default=(0.0, 0.0), unit="1")',
     )
-    @killed_by("tune/weights.py", "if shapes != ((n,), (n * (n - 1) // 2,)):", "if False:")
+    @killed_by("tune.weights", "if shapes != ((n,), (n * (n - 1) // 2,)):", "if False:")
     def test_any_number_of_states(self):
         loop = lq_weights(RIG, np.ones(4), 1.0, lqr_gain_design(SlipModel()))
         assert not list(find_problems(loop))
@@ -444,8 +442,8 @@ class TestWeights:
         assert list(find_problems(fewer)) == [f"log_diagonal and lower have shapes (4,), (3,); {needs}"]
         assert list(find_problems(square)) == [f"log_diagonal and lower have shapes (4, 4), (6,); {needs}"]
 
-    @killed_by("tune/weights.py", 'q = as_weight_matrix("Q", Q, len(np.atleast_1d(Q)), definite=True)', "q = Q")
-    @killed_by("tune/weights.py", 'r = as_weight_matrix("R", R, 1, definite=True)', "r = np.array([[R]])")
+    @killed_by("tune.weights", 'q = as_weight_matrix("Q", Q, len(np.atleast_1d(Q)), definite=True)', "q = Q")
+    @killed_by("tune.weights", 'r = as_weight_matrix("R", R, 1, definite=True)', "r = np.array([[R]])")
     @pytest.mark.parametrize(
         ("q", "r", "message"),
         [
@@ -473,7 +471,7 @@ class TestSpeedScaled:
         np.testing.assert_allclose(*poles, atol=1e-12)
 
     @killed_by(
-        "design/speed_scaled.py", "jnp.where(torque, 1 + scaled.fall, 1.0) / s", "jnp.where(torque, 1.0, 1.0) / s"
+        "robust.design.speed_scaled", "jnp.where(torque, 1 + scaled.fall, 1.0) / s", "jnp.where(torque, 1.0, 1.0) / s"
     )
     def test_a_falling_speed_is_followed_step_by_step(self):
         """Two periods, from v to v+: the physical states, brought to z with the speed of their own instant."""
@@ -503,11 +501,11 @@ BOX = {"plant.mass": (4.0, 8.0), "plant.road.w4": (0.3, 0.5), "actuator.time_con
 
 
 @killed_by(
-    "tune/worst.py",
+    "tune.worst",
     "math.isclose(self.value, self.corner, rel_tol=CORNER_TOLERANCE)",
     "self.value <= self.corner * (1 + CORNER_TOLERANCE)",
 )
-@killed_by("tune/worst.py", "if math.isclose(self.value, self.corner, rel_tol=CORNER_TOLERANCE):", "if False:")
+@killed_by("tune.worst", "if math.isclose(self.value, self.corner, rel_tol=CORNER_TOLERANCE):", "if False:")
 @pytest.mark.parametrize(
     ("value", "corner", "screened", "words"),
     [
@@ -588,11 +586,11 @@ TWO_ASCENTS = {"over": SLIPS, "metric": "short", "solver": COARSE, "screen": 0, 
 class TestWorstCase:
     @pytest.mark.slow
     @killed_by(
-        "tune/worst.py",
+        "tune.worst",
         "run_batch(loop, batch, solver,",
         "run_batch(loop, batch, dataclasses.replace(solver, kinks=True),",
     )
-    @killed_by("tune/worst.py", "    if len(ends):\n", "    if False:\n")
+    @killed_by("tune.worst", "    if len(ends):\n", "    if False:\n")
     def test_the_value_is_that_of_a_plain_run(self):
         """Steps of an ascent end on kinks, here worth more than what the ascent gains."""
         measured = {"short": Limited()}
@@ -604,7 +602,7 @@ class TestWorstCase:
 
     @pytest.mark.slow
     @killed_by(
-        "tune/worst.py",
+        "tune.worst",
         "np.flatnonzero(runs.diverged | np.isnan(runs.metrics[metric]))",
         "np.flatnonzero((runs.diverged | np.isnan(runs.metrics[metric]))[:screened])",
     )
@@ -616,8 +614,8 @@ class TestWorstCase:
         assert 0.08 < found.diverged["reference.slip"] < 0.4
         assert found.report().startswith("COUNTEREXAMPLE: the run diverges at reference.slip = ")
 
-    @killed_by("tune/worst.py", "if len(ends) != 2 or not np.isfinite(ends).all():", "if len(ends) != 2:")
-    @killed_by("tune/worst.py", "or count < 0:", "or False:")
+    @killed_by("tune.worst", "if len(ends) != 2 or not np.isfinite(ends).all():", "if len(ends) != 2:")
+    @killed_by("tune.worst", "or count < 0:", "or False:")
     @pytest.mark.parametrize(
         ("change", "message"),
         [
@@ -668,7 +666,7 @@ class TestWorstCase:
         assert found.corner <= found.screened <= found.value
         assert found.report().startswith("COUNTEREXAMPLE: max_slip" if not found.met else "No counterexample in")
 
-    @killed_by("tune/worst.py", "for lane in lanes if lane.reason is not Reason.START]", "for lane in []]")
+    @killed_by("tune.worst", "for lane in lanes if lane.reason is not Reason.START]", "for lane in []]")
     @pytest.mark.slow
     def test_the_ascent_finds_what_lies_between_the_points(self):
         """The shortest way of all slips, beside a thousand of them: at no corner."""
@@ -690,10 +688,10 @@ class TestWorstCase:
         np.testing.assert_allclose([found.value, found.rollouts], [worst, len(points)], rtol=1e-12)
 
     @killed_by(
-        "tune/worst.py", "np.random.default_rng(seed).permuted(both, axis=0)", "both[:1].repeat(64, 0)", case="last"
+        "tune.worst", "np.random.default_rng(seed).permuted(both, axis=0)", "both[:1].repeat(64, 0)", case="last"
     )
     @killed_by(
-        "tune/worst.py", "itertools.product(*ranges[:FULL_CORNERS])", "itertools.product(*ranges[-6:])", case="first"
+        "tune.worst", "itertools.product(*ranges[:FULL_CORNERS])", "itertools.product(*ranges[-6:])", case="first"
     )
     @pytest.mark.slow
     @pytest.mark.parametrize("place", ["first", "last"])
@@ -710,7 +708,7 @@ class TestWorstCase:
         assert found.corners == 64
         assert "it is one of the 64 corners (of 128) that were run" in found.report()
 
-    @killed_by("tune/worst.py", "price * sum(lane.evaluations for lane in lanes)", "price * len(lanes)")
+    @killed_by("tune.worst", "price * sum(lane.evaluations for lane in lanes)", "price * len(lanes)")
     @pytest.mark.slow
     def test_every_gradient_is_counted(self, monkeypatch):
         """Of one ascent: each evaluation with a gradient is one point."""

@@ -16,7 +16,10 @@ from jax.typing import DTypeLike
 from diffabs.compiler.ir import Graph, Node, UpdateLevel
 
 PACKAGE = pathlib.Path(__file__).parents[2]
-INTERNAL_PATHS = (pathlib.Path(jax.__file__).parent, *(PACKAGE / name for name in ("core", "compiler", "export")))
+INTERNAL_PATHS = (
+    pathlib.Path(jax.__file__).parent,
+    *(PACKAGE / name for name in ("core", "compiler", "output/export")),
+)
 ANONYMOUS = ("<lambda>", "<listcomp>", "<genexpr>", "<module>")
 
 

@@ -19,7 +19,7 @@ from diffabs.compiler.ir import Graph, Node, NodeArray
 from diffabs.core.types import PyTree, Scalar
 
 JAX = pathlib.Path(jax.__file__).parent
-INTERNAL_FOLDERS = [pathlib.Path(__file__).parents[2] / name for name in ("core", "compiler", "simulate")]
+INTERNAL_FOLDERS = [pathlib.Path(__file__).parents[2] / name for name in ("core", "compiler", "engine", "loop")]
 
 
 class Unsupported(Exception):

@@ -11,7 +11,7 @@ from diffabs.compiler.listing import count_by_level
 from diffabs.compiler.program import ScalarProgram
 from diffabs.compiler.runtime import toolchain
 from diffabs.core.types import PyTree
-from diffabs.runtime.process import core_count
+from diffabs.host.process import core_count
 
 MAX_STEP_LINES = 10_000  # operations times vectors; a larger program gets fewer vectors, or compiling takes too long
 LIBRARY_NAME_PREFIX = "diffabs_kernel_"

@@ -20,7 +20,7 @@ from diffabs.compiler.program import ScalarProgram
 from diffabs.compiler.runtime import nvrtc
 from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.types import PyTree
-from diffabs.runtime.process import default_devices
+from diffabs.host.process import default_devices
 
 # CUDA's enumerators CU_POINTER_ATTRIBUTE_DEVICE_ORDINAL and CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT.
 ORDINAL, MULTIPROCESSORS = 9, 16

@@ -14,7 +14,7 @@ import os
 import pathlib
 import sys
 
-from diffabs.runtime import files
+from diffabs.host import files
 
 CACHE = "DIFFABS_KERNEL_CACHE"  # environment variable: folder of the compiled libraries
 MAX_CACHE_BYTES = 1 << 28  # about 800 libraries; a larger cache loses its less recently used half

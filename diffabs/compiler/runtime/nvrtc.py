@@ -13,7 +13,7 @@ import re
 
 from diffabs.compiler.runtime import library_cache
 from diffabs.compiler.runtime.toolchain import NATIVE_FOLDER, NoCompiler
-from diffabs.runtime import files
+from diffabs.host import files
 
 HEADERS = ("lane.h", "threads.h")
 # Flags must preserve subnormal numbers and IEEE division and roots. The last two only control messages.

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import jax.ffi
 
 from diffabs.compiler.runtime.library_cache import cache_folder, find_library, make_cache_folder, write_library
-from diffabs.runtime import files, stopwatch
+from diffabs.host import files, stopwatch
 
 NATIVE_FOLDER = pathlib.Path(__file__).parents[1] / "native"
 COMPILER = "DIFFABS_KERNEL_COMPILER"  # environment variable: compiler command; empty means no compiler

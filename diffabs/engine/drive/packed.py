@@ -1,0 +1,185 @@
+"""Batches in which no run waits for another one: for values and not for gradients.
+
+A batch under `jax.vmap` steps until its slowest run ends. Here only `LANES_AT_ONCE` runs step at a time. Every
+`STEPS_PER_EXCHANGE` steps the runs that have ended are removed, and the next runs take their places.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.first_order import first_order
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.core.tracing import split_batched
+from diffabs.core.types import Array, Bool, Params, PyTree, Scalar, Vector
+from diffabs.engine.arguments import forbid_derivatives, prepare_arguments
+from diffabs.engine.drive.loops import STEPS_PER_BLOCK, MethodCarry
+from diffabs.engine.result import finish_run, prepare
+from diffabs.engine.step.status import RunStatus
+from diffabs.engine.types import Run, Solver
+
+LANES_AT_ONCE = 512  # runs that step at a time: their state stays in a processor's cache
+STEPS_PER_EXCHANGE = 64  # steps between two exchanges of runs
+VALUES_ONLY = "together=False has no derivatives by XLA: leave it out, or take engine='kernel' for forward mode"
+
+
+class EarlyEnd(Protocol):
+    """A condition that ends a run before its stop and its duration, because its outcome is already known; a pytree."""
+
+    def data_of(self, number: Scalar) -> PyTree:
+        """Return the data for run `number` that the condition needs, a pytree."""
+        ...
+
+    def has_reached(self, data: object, output: object) -> Bool:
+        """Return True if the run ends, given its `data` and the present `output` of its plant."""
+        ...
+
+
+def run_packed(
+    loop: Loop,
+    values: Params,
+    keys: object,
+    solver: Solver,
+    objectives: Mapping[str, Objective],
+    accepted: Vector,
+    enough: EarlyEnd | None = None,
+    numbers: Array | None = None,
+) -> Run:
+    """Return the results of `measure` for runs that differ in their values and keys. Not for derivatives.
+
+    A run that is not accepted has diverged. A run that `enough` ends has no end flag. `values` have shape (runs, ...)
+    by dotted path, and `keys`, `accepted` and `numbers`, by which `enough` knows the runs, shape (runs,).
+    """
+    loop, objectives, method = prepare_arguments(loop, solver, objectives)
+    values = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
+    values = {**values, **forbid_derivatives(loop, values)}
+    numbers = jnp.arange(len(accepted)) if numbers is None else numbers
+    # Of the inputs themselves, not of tangents: so already their first derivative is an error.
+    loop, values, objectives = first_order((loop, values, objectives), VALUES_ONLY)
+    return _run(loop, values, objectives, method, keys, accepted, enough, numbers, width=LANES_AT_ONCE)
+
+
+def split_by_lane(
+    loop: Loop, values: dict[str, PyTree], objectives: dict[str, Objective]
+) -> tuple[PyTree, Callable[[PyTree], tuple[PyTree, PyTree]]]:
+    """Return the leaves of the prepared loops that depend on the values, and a function from those of one run to its
+    loop and objectives, with the plant's audit. All other leaves are computed once.
+    """
+    leaves, whole = split_batched(lambda v: prepare(replace(loop, v)), values)
+
+    def build_lane(lane_leaves: object) -> tuple[Loop, dict[str, Objective]]:
+        lane_loop, audit = whole(lane_leaves)
+        return lane_loop, objectives | audit
+
+    return leaves, build_lane
+
+
+class _LaneSlots(NamedTuple):
+    """Runs in progress and runs that have ended.
+
+    Attributes:
+        leaves: Leaves of the prepared loops that differ between the runs.
+        keys: Random keys.
+        carry: Carries.
+        number: Number of the run in each slot; the number of runs in an empty slot.
+        next: Number of the next run to start.
+        ended: Results of the runs that have ended, by number.
+    """
+
+    leaves: PyTree
+    keys: PyTree
+    carry: MethodCarry
+    number: Scalar
+    next: Any
+    ended: Run
+
+
+@partial(jax.jit, static_argnames="width")
+def _run(
+    loop: Loop,
+    values: dict[str, PyTree],
+    objectives: dict[str, Objective],
+    method: PyTree,
+    keys: PyTree,
+    accepted: Vector,
+    enough: EarlyEnd | None,
+    numbers: Array,
+    *,
+    width: int,
+) -> Run:
+    """Return the results of all runs, in their order; `width` runs step at a time, by the stepping method `method`."""
+    count = len(accepted)
+    leaves, build_lane = split_by_lane(loop, values, objectives)
+    step_all = jax.vmap(lambda lane_leaves, key, carry: method.step(*build_lane(lane_leaves), key, carry))
+    renew_all = jax.vmap(lambda lane_leaves, carry: method.renew(build_lane(lane_leaves)[0], carry))
+    start = jax.vmap(lambda lane_leaves, key: method.start(*build_lane(lane_leaves), key))
+    finish = jax.vmap(lambda lane_leaves, carry: finish_run(*build_lane(lane_leaves), carry)[0])
+
+    def take_lanes(number: Scalar) -> tuple[PyTree, PyTree, MethodCarry]:
+        """Return leaves, keys and carries of these runs at t = 0; beyond the last run a copy that does not step."""
+        lane_leaves, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
+        carry = start(lane_leaves, key)
+        status = jnp.where(run & (number < count), carry.status, RunStatus.REFUSED)
+        return lane_leaves, key, carry._replace(status=status.astype(carry.status.dtype))
+
+    def step_and_exchange(slots: _LaneSlots) -> _LaneSlots:
+        def step_once(carry: MethodCarry, _: object) -> tuple[MethodCarry, None]:
+            return step_all(slots.leaves, slots.keys, carry), None
+
+        def renew_and_step(carry: object, _: object) -> tuple[PyTree, None]:
+            return jax.lax.scan(step_once, renew_all(slots.leaves, carry), length=STEPS_PER_BLOCK)[0], None
+
+        slots = slots._replace(
+            carry=jax.lax.scan(renew_and_step, slots.carry, length=STEPS_PER_EXCHANGE // STEPS_PER_BLOCK)[0]
+        )
+        free = ~slots.carry.running | _lanes_ended_early(enough, build_lane, slots, numbers)
+        return _exchange_lanes(slots, free, finish, take_lanes, count)
+
+    number = jnp.arange(min(width, count))
+    first = take_lanes(number)
+    shapes = jax.eval_shape(finish, first[0], first[2])
+    ended = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
+    slots = _LaneSlots(*first, number, number[-1] + 1, ended)
+    return jax.lax.while_loop(lambda slots: jnp.any(slots.number < count), step_and_exchange, slots).ended
+
+
+def _lanes_ended_early(
+    enough: EarlyEnd | None, build_lane: Callable[[PyTree], PyTree], slots: _LaneSlots, numbers: Array
+) -> PyTree:
+    """Return True for each slot whose run ends early; `build_lane` returns the loop and objectives of one run."""
+    if enough is None:
+        return jnp.zeros_like(slots.carry.running)
+    output = jax.vmap(lambda lane_leaves, at: build_lane(lane_leaves)[0].plant.output(at.point.state.plant))(
+        slots.leaves, slots.carry
+    )
+    lane_numbers = numbers[jnp.minimum(slots.number, len(numbers) - 1)]
+    return jax.vmap(lambda number, output: enough.has_reached(enough.data_of(number), output))(lane_numbers, output)
+
+
+def _exchange_lanes(
+    slots: _LaneSlots,
+    free: PyTree,
+    finish: Callable[[PyTree, MethodCarry], Run],
+    take_lanes: Callable[[PyTree], PyTree],
+    count: int,
+) -> _LaneSlots:
+    """Return the slots with the results of free slots stored (by `finish`) and the next runs in them (`take_lanes`)."""
+    place, runs = jnp.where(free, slots.number, count), finish(slots.leaves, slots.carry)
+    # Slots that are not free write to the place `count`, beyond the end: the mode "drop" discards them.
+    ended = jax.tree.map(lambda all, x: all.at[place].set(x, mode="drop"), slots.ended, runs)
+    # The cumulative sum gives free slots consecutive numbers.
+    number = jnp.where(free, slots.next + jnp.cumsum(free) - 1, slots.number)
+    old = (slots.leaves, slots.keys, slots.carry)
+    lane_leaves, key, carry = jax.tree.map(partial(_select_lanes, free), take_lanes(number), old)
+    return _LaneSlots(lane_leaves, key, carry, jnp.minimum(number, count), slots.next + jnp.sum(free), ended)
+
+
+def _select_lanes(free: Array, a: Array, b: Scalar) -> PyTree:
+    if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_select_lanes(free, jax.random.key_data(a), jax.random.key_data(b)))
+    return jnp.where(free.reshape(-1, *[1] * (a.ndim - 1)), a, b)

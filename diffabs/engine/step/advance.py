@@ -1,0 +1,373 @@
+"""The step of a run: `advance` makes one attempt. The carry of a run, and the interface of stepping methods.
+
+    propose    which step to attempt, in which mode
+    attempt    `attempt.attempt_step`: the same for every method
+    decide     accept the step, search within it, or end the run
+    commit     `attempt.commit_step`: the same for every method
+    plan_next  the length and status of the next attempt
+
+`FixedStepping`, `AdaptiveStepping` and `ReplayStepping` differ in these and in the coefficients of their step.
+"""
+
+from collections.abc import Callable
+from functools import partial, reduce
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jax.typing import DTypeLike
+
+from diffabs.core.lanes import any_lane, jit_barrier, keep_decision, select
+from diffabs.core.log import borrow, log_rows, write_last_rows
+from diffabs.core.loop import Loop, LoopState, Margins
+from diffabs.core.protocols import Clock
+from diffabs.core.types import Array, Bool, Int, PyTree, Scalar
+from diffabs.engine.step.attempt import (
+    Attempt,
+    Point,
+    StepRequest,
+    attempt_step,
+    commit_step,
+    evaluate_point,
+    flip_answer,
+    mode_after_changes,
+    mode_in_step,
+    start_state,
+)
+from diffabs.engine.step.event_location import (
+    EventSearch,
+    SearchPlan,
+    continue_search,
+    falls_through,
+    find_crossings,
+    init_search,
+)
+from diffabs.engine.step.modes import Mode
+from diffabs.engine.step.runge_kutta import Tableau
+from diffabs.engine.step.slides import init_watch, watch_landing
+from diffabs.engine.step.status import RunStatus, is_running, status_after_step
+from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, LoopSystem, Objectives, build_system
+
+
+class Carry(NamedTuple):
+    """State of a run between two attempts.
+
+    Attributes:
+        point: Point of the run that the last accepted attempt reached.
+        k: Number of the last instant of the grid at which a clock struck. With fixed steps one strikes at each instant.
+        since: Time since that instant [s]. It is summed, because the difference of two large times would lose digits.
+        length: Length of the next attempt [s].
+        strikes: True if the next attempt ends where a clock strikes next, or with the run.
+        base: Length of the regular attempt [s], the scale of a search within it. Adaptive steps begin it at this point;
+            with fixed steps it is the step of the grid.
+        search: Search for an event.
+        unrestricted: True if each stage evaluates its comparisons, in a run whose steps otherwise keep to a mode.
+        slides: Watch for slides (`SlideWatch`); () if switching surfaces are not located.
+        control: Numbers of the stepping method.
+        status: Status of the run, a `RunStatus`.
+    """
+
+    point: Point
+    k: Int
+    since: Scalar
+    length: Scalar
+    strikes: Bool
+    base: Array
+    search: EventSearch
+    unrestricted: Bool
+    slides: PyTree
+    control: PyTree
+    status: Array
+
+    running = property(is_running)
+
+
+class Decision(NamedTuple):
+    """Decision on an attempt.
+
+    Attributes:
+        valid: True if its numbers are finite and plausible.
+        accepted: True if the attempt is accepted.
+        searches: True if the search for an event or a switching surface begins or goes on.
+        crosses_surface: True if an accepted attempt ends on a switching surface.
+        triggered: True for each event at its end.
+        mode: Mode after the changes at its end.
+        over: True if the run ends there.
+    """
+
+    valid: Bool
+    accepted: Bool
+    searches: Bool
+    crosses_surface: Bool
+    triggered: Margins
+    mode: Mode
+    over: Bool
+
+
+class Stepping(Protocol):
+    """A stepping method: what `advance` needs of it."""
+
+    @property
+    def h(self) -> Array:
+        """Step of the grid [s]."""
+        ...
+
+    @property
+    def tableau(self) -> Tableau:
+        """Coefficients of its Runge-Kutta step."""
+        ...
+
+    @property
+    def has_margin_rates(self) -> bool:
+        """True if the rates of all margins are evaluated."""
+        ...
+
+    @property
+    def searches(self) -> bool:
+        """True if the method locates events; False if a log says where they are, or there are none."""
+        ...
+
+    @property
+    def smooth(self) -> bool:
+        """True if nothing switches and no event can happen."""
+        ...
+
+    @property
+    def second_order(self) -> bool:
+        """True if the times of events have second derivatives."""
+        ...
+
+    def is_active(self, carry: Carry, until: Int | None) -> Bool:
+        """Return True if the run of `carry` goes on and has not reached the instant `until` of the grid."""
+        ...
+
+    def is_switched(self, loop: Loop) -> bool:
+        """Return True if the comparisons of the `loop`'s flow are visible."""
+        ...
+
+    def is_calm(self, carry: Carry) -> Bool:
+        """Return True if the attempt of `carry` is so long that an earlier landing is over."""
+        ...
+
+    def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
+        """Return the next step to attempt, by the run of `carry` in `system`."""
+        ...
+
+    def forecast(self, carry: Carry, dynamics: Evaluation) -> PyTree:
+        """Return the predicted time [s] to the next change of a comparison, from the `dynamics` at an instant.
+
+        A method without a prediction returns (). `carry` is the run before the step that ends at the instant.
+        """
+        ...
+
+    def report(
+        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: object
+    ) -> Any:
+        """Return the findings about an attempt, by the run of `carry` in `system`, that the method needs.
+
+        The attempt has the length `h`. The `dynamics` and the `state` are those at its end, and `error` holds the
+        shares of the rates in the error.
+        """
+        ...
+
+    def decide(
+        self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
+    ) -> Decision:
+        """Return the decision on the `attempt` that answers the `request`, by the run of `carry` in `system`.
+
+        `active` is False if the run needs no attempt.
+        """
+        ...
+
+    def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+        """Return the carry `after` an `attempt` with length and status of the next attempt.
+
+        `carry` is the run in `system` before the attempt, and `decision` the decision on it. `after` has the new point
+        and, from a method that `searches` or is `smooth`, the status; if it `searches`, also the search and its length.
+        """
+        ...
+
+
+def advance(
+    stepping: Stepping, loop: Loop, objectives: Objectives, key: PyTree, carry: Carry, until: Int | None = None
+) -> Carry:
+    """Return the carry after one attempt of a step.
+
+    Point and status of a run that is over do not change. With `until`, the number of the grid instant at which to
+    pause, the whole carry does not change if the run is over or has reached that instant.
+    """
+    active = stepping.is_active(carry, until)
+    # The blocks' logs leave the carry: `select` below would otherwise copy whole tables in every step.
+    logs = write_last_rows(carry.point.state)
+    start = carry.point._replace(state=borrow(carry.point.state, None))
+    carry = carry._replace(point=start)
+    system = build_system(
+        *(loop, objectives, start.t, start.state, start.accumulators),
+        switched=stepping.is_switched(loop),
+        has_margin_rates=stepping.has_margin_rates,
+    )
+    request, forecast = stepping.propose(system, carry), partial(stepping.forecast, carry)
+
+    def attempt_request() -> Attempt:
+        report = partial(stepping.report, system, carry, request.h)
+        return attempt_step(system, start, request, stepping.tableau, forecast, report)
+
+    # Without the barriers, XLA would compile the attempt again into each expression that uses it. A step in which
+    # nothing is searched has few such expressions. For derivatives the barrier also skips attempts beyond the end,
+    # where reverse mode would multiply 0 by a rate that may be infinite.
+    barrier = jit_barrier if stepping.second_order or not stepping.smooth else lambda active, work: work()
+    attempt = barrier(active, attempt_request)
+    decision = keep_decision(barrier(active, lambda: stepping.decide(system, carry, request, attempt, active)))
+
+    strikes = decision.accepted & request.strikes
+    k = jnp.where(strikes, request.strike, carry.k)
+    clock = Clock(attempt.point.t, stepping.h, k, key, strikes)
+
+    def commit() -> Point:
+        return commit_step(system, start, attempt, clock, decision.triggered, decision.mode, logs, forecast)
+
+    # Where a run ends, no block changes any more.
+    point = select(decision.over, attempt.point, jit_barrier(active, commit) if loop.changes else commit())
+    point = select(decision.accepted, point, start)
+    since = jnp.where(strikes, 0.0, jnp.where(decision.accepted, carry.since + request.h, carry.since))
+    after = carry._replace(point=point, k=k, since=since)
+    if carry.slides:
+        landed, running = decision.crosses_surface, carry.status == RunStatus.RUNNING
+        calm = decision.accepted & running & stepping.is_calm(carry)
+        after = after._replace(slides=watch_landing(carry.slides, carry.search, landed, calm, attempt.point.t))
+    if stepping.searches:
+        after = _search(stepping, system, carry, attempt, decision, after)
+    elif stepping.smooth:
+        after = after._replace(status=_next_status(system, carry, attempt, decision, carry.status))
+    after = stepping.plan_next(system, carry, attempt, decision, after)
+    status = jnp.where(active, after.status, carry.status).astype(carry.status.dtype)
+    status, unrestricted = keep_decision((status, after.unrestricted))
+    after = after._replace(status=status, unrestricted=unrestricted)
+    if until is not None:  # without a pause, the other fields of a run that is over have no effect
+        after = select(active, after, carry)
+    return after._replace(point=after.point._replace(state=borrow(after.point.state, logs)))
+
+
+def _search(
+    stepping: Stepping, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
+) -> Carry:
+    """Return the carry `after` an attempt with the search for an event continued, and with the next status."""
+    plan = SearchPlan(carry.search, carry.length, carry.status)
+
+    def next_plan() -> SearchPlan:
+        margins = (jax.tree.leaves(point.margins) for point in (carry.point, attempt.point))
+        crossings = find_crossings(carry.search.number, system.bit_count, attempt.report.surface, *margins)
+        next_search = continue_search(plan, crossings, carry.base, system.bit_count, refines=stepping.second_order)
+        return select(decision.searches, next_search, plan)
+
+    # Few attempts search, so a batch skips the search unless one of its runs needs it.
+    search, length, status = jax.lax.cond(any_lane(decision.searches), next_plan, lambda: plan)
+    number, located, at_once = keep_decision((search.number, search.located, search.at_once))
+    search = search._replace(number=number, located=located, at_once=at_once)
+    status = _next_status(system, carry, attempt, decision, status)
+    return after._replace(search=search, length=length, status=status)
+
+
+def _next_status(system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, status: Scalar) -> Scalar:
+    """Return the status after an attempt; `status` where it was not accepted."""
+    return jnp.where(decision.accepted, status_after_step(system.loop, carry, attempt, decision), status)
+
+
+def start_carry(
+    stepping: Stepping,
+    loop: Loop,
+    objectives: Objectives,
+    key: PyTree,
+    forecast: Callable[[Evaluation], PyTree] = lambda dynamics: (),
+) -> Carry:
+    """Return the carry of a run at t = 0, without the numbers of the stepping method.
+
+    A run that starts at its stop or beyond has diverged.
+    """
+    none, zero = 0.0 * stepping.h, jnp.asarray(0)
+    # With the types of later steps the loop is traced once for all of them.
+    state, accumulators = cast_floats(start_state(loop, objectives, Clock(none, stepping.h, zero, key)), none.dtype)
+    logs, state = log_rows(state), borrow(state, None)
+    system = build_system(
+        *(loop, objectives, none, state, accumulators),
+        switched=stepping.is_switched(loop),
+        has_margin_rates=stepping.has_margin_rates,
+    )
+    point = evaluate_point(system, none, state, accumulators, UNCONSTRAINED, forecast)
+    status = jnp.where(point.margins["stop"][0] > 0, zero + RunStatus.RUNNING, zero + RunStatus.MISSED)
+    point = point._replace(state=borrow(state, logs))
+    search, yes, no = init_search(stepping.h), jnp.asarray(True), jnp.asarray(False)
+    slides = init_watch(system.word_count, none) if system.bit_count and stepping.searches else ()
+    return Carry(point, zero, none, stepping.h, yes, stepping.h, search, no, slides, (), status)
+
+
+def propose_step(stepping: Stepping, system: LoopSystem, carry: Carry, strike: Int, *, frozen: bool) -> StepRequest:
+    """Return the step to attempt next, which keeps to a mode if `frozen`.
+
+    `strike` is the number of the next instant at which a clock strikes, or the run ends.
+    """
+    refresh, mode = carry.status == RunStatus.REFRESHING, UNCONSTRAINED
+    if frozen:
+        number, words = carry.search.number, carry.point.words
+        beyond = mode_after_changes(system, words, number, number < system.bit_count)
+        mode = select(refresh, beyond, mode_in_step(system, words, carry.unrestricted))
+    end = jnp.where(carry.strikes, strike * stepping.h, carry.point.t + carry.length)
+    return StepRequest(carry.length, end, stepping.h, mode, refresh, carry.strikes, strike)
+
+
+def decide_attempt(
+    stepping: Stepping,
+    system: LoopSystem,
+    carry: Carry,
+    attempt: Attempt,
+    active: Bool,
+    valid: Bool,
+    exact: Bool,
+    *,
+    last: Bool,
+    frozen: bool,
+) -> Decision:
+    """Return the decision on an attempt: accept it, search within it, or end the run.
+
+    `valid` says that its numbers are finite and plausible, and `exact` that it is accurate enough, too, or cannot be
+    made shorter. The run ends with the `last` attempt. A `frozen` step keeps to a mode.
+    """
+    if stepping.smooth:
+        no, accepted = jnp.asarray(False), active & valid & exact
+        none = jax.tree.map(lambda margin: no, attempt.point.margins)
+        return Decision(valid, accepted, no, no, none, UNCONSTRAINED, accepted & last)
+    running, landing, refreshing = (
+        carry.status == status for status in (RunStatus.RUNNING, RunStatus.LANDING, RunStatus.REFRESHING)
+    )
+    surface, bit_count, number = attempt.report.surface, system.bit_count, carry.search.number
+    crossed = falls_through(jax.tree.leaves(carry.point.margins), jax.tree.leaves(attempt.point.margins))
+    crosses = [*crossed, *([] if surface is None else [surface.contradicted, surface.unsought >= 0])]
+    crosses = jnp.any(jnp.stack(crosses))
+    accepted = active & valid & (landing | refreshing | (running & exact & ~crosses))
+    searches = active & ~landing & ~refreshing & (~running | (exact & crosses))
+    triggered = [accepted & landing & ((number == bit_count + i) | falls) for i, falls in enumerate(crossed)]
+    triggered = jax.tree.unflatten(jax.tree.structure(attempt.point.margins), triggered)
+    over = reduce(jnp.logical_or, triggered["stop"]) | (accepted & last)
+    lands, mode = jnp.asarray(False), UNCONSTRAINED
+    if frozen:
+        lands = accepted & landing & (number < bit_count)
+        words = flip_answer(system, attempt.point.words, number, lands)
+        mode = mode_after_changes(system, words, number, lands)
+    return Decision(valid, accepted, searches, lands, triggered, mode, over)
+
+
+def have_same_answers(carry: Carry, attempt: Attempt) -> Bool:
+    """Return True if the comparisons have the same answers at both ends of an attempt."""
+    pairs = zip(attempt.point.words, carry.point.words, strict=True)
+    return jnp.all(jnp.array([a == b for a, b in pairs], bool))
+
+
+def cast_floats(tree: object, dtype: DTypeLike) -> PyTree:
+    """Return the tree with strong types throughout, and its floating-point leaves cast to one type."""
+
+    # A scan rejects a carry whose type weakens or strengthens.
+    def cast(x: Scalar) -> Array:
+        x = jnp.asarray(x)
+        return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(x.dtype)
+
+    return jax.tree.map(cast, tree)

@@ -1,0 +1,244 @@
+"""One step of a run: `attempt_step` integrates, `commit_step` changes the blocks at the end.
+
+    attempt_step   integrates over the step within one mode, lets the plant project its state, evaluates the dynamics at
+                   the end, and updates the objectives over the step
+    commit_step    lets the events and ticks of the blocks happen at the end of an accepted step
+
+Nothing else integrates, projects or accumulates, and nothing else changes a block. What chooses the steps is a
+`Stepping` (`advance`).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.cubic import HermiteStep
+from diffabs.core.lanes import select
+from diffabs.core.log import borrow
+from diffabs.core.loop import Loop, LoopState, Margins, Signals
+from diffabs.core.numerics import axpy
+from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
+from diffabs.core.types import Any, Array, Bool, Int, PyTree, Scalar
+from diffabs.engine.step.modes import Mode, ModeBits, single_bit
+from diffabs.engine.step.runge_kutta import Tableau, runge_kutta_step
+from diffabs.engine.step.surfaces import valid_end_rates
+from diffabs.engine.step.system import (
+    Accumulators,
+    Evaluation,
+    LoopSystem,
+    Objectives,
+    split_flow_and_held,
+    with_flow,
+)
+
+
+class Point(NamedTuple):
+    """A run at an instant.
+
+    Attributes:
+        t: Time [s].
+        state: State of the loop.
+        accumulators: Accumulators of the objectives.
+        sample: Sample of the signals.
+        signal_rates: Rates of the signals, as `LoopSystem.signal_rates` says.
+        recorded: Signals that blocks record, and their rates, each by block.
+        rates: Rates of the loop's flow and of the objectives' integrals.
+        margins: Margins of the stop and of the blocks' events.
+        words: Answers to the comparisons: the mode of the next step.
+        forecast: Prediction of the stepping method from here (`Stepping.forecast`).
+    """
+
+    t: Array
+    state: LoopState
+    accumulators: Accumulators
+    sample: Sample
+    signal_rates: PyTree
+    recorded: tuple[dict[str, PyTree], dict[str, PyTree]]
+    rates: tuple[PyTree, PyTree]
+    margins: Margins
+    words: ModeBits
+    forecast: PyTree
+
+
+class StepRequest(NamedTuple):
+    """A step to attempt.
+
+    Attributes:
+        h: Length [s].
+        end: Time at the end [s].
+        grid: Step of the grid [s].
+        mode: Mode of the step.
+        refresh: True for a step of length 0 that evaluates the rates after an event or a switching surface.
+        strikes: True if the step ends where a clock strikes, or with the run.
+        strike: Number of that instant of the grid.
+        shift_end: Function that returns the time [s] to add to the step, from the dynamics at its requested end; None
+            for none. The time is zero to rounding, but has the derivative of the event's time there.
+    """
+
+    h: Scalar
+    end: Scalar
+    grid: Scalar
+    mode: Mode
+    refresh: Bool
+    strikes: Bool
+    strike: Int
+    shift_end: Callable[[Evaluation], Scalar] | None = None
+
+
+class Attempt(NamedTuple):
+    """The end of an attempted step.
+
+    Attributes:
+        point: The end, before the changes there.
+        signals: Signals of the loop.
+        shift: Time [s] by which the end lies later than requested.
+        report: What the stepping method needs for its decision.
+    """
+
+    point: Point
+    signals: Signals
+    shift: Scalar
+    report: PyTree
+
+
+Forecast = Callable[[Evaluation], PyTree]  # `Stepping.forecast`, for a run
+
+
+def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopState, Accumulators]:
+    """Return state and accumulators at t = 0, after the first ticks and the events of blocks with a negative margin."""
+    state = loop.start()
+    signals = loop.signals(clock.t, state)
+    accumulators = {name: objective.start(signals.sample) for name, objective in objectives.items()}
+    if loop.changes:
+        margins = loop.margins(clock.t, state, signals, lambda: loop.flow(clock.t, state, signals))
+        state = loop.change(clock, state, signals, margins, jax.tree.map(lambda margin: margin < 0, margins))
+    return state, accumulators
+
+
+def evaluate_point(
+    system: LoopSystem, t: Array, state: LoopState, accumulators: Accumulators, mode: Mode, forecast: Forecast
+) -> Point:
+    """Return the point at an instant, from the state after the changes there."""
+    return _build_point(system.evaluate(t, state, accumulators, mode), t, state, accumulators, forecast)
+
+
+def attempt_step(
+    system: LoopSystem,
+    point: Point,
+    request: StepRequest,
+    tableau: Tableau,
+    forecast: Forecast,
+    report: Callable[[Evaluation, LoopState, PyTree], PyTree],
+) -> Attempt:
+    """Return the end of one Runge-Kutta step from a point.
+
+    `report` returns what the stepping method needs for its decision, from the dynamics at the end, the state there, and
+    the shares of the rates in the error.
+    """
+    loop, (t, h), mode = system.loop, (request.end, request.h), request.mode
+    z, held = split_flow_and_held(point.state, point.accumulators)
+
+    def flow(t: Scalar, z: object, constants: tuple[PyTree, Mode]) -> PyTree:
+        return system.rates(t, z, *constants)
+
+    z, error = runge_kutta_step(tableau, flow, point.t, z, point.rates, h, (held, mode))
+    shift = jnp.zeros_like(h)
+    if request.shift_end:
+        dynamics = system.evaluate(t, *with_flow(point.state, point.accumulators, z), mode)
+        shift = request.shift_end(dynamics)
+        t, h, z = t + shift, h + shift, axpy(shift, dynamics.rates, z)
+    state, accumulators = with_flow(point.state, point.accumulators, z)
+    projected = state._replace(plant=loop.plant.project(state.plant))
+    # A projection may move the state onto a switching surface, so the end of a frozen mode is evaluated without it.
+    frozen = mode.words is not None and system.program is not None
+    state = select(mode.free, projected, state) if frozen else projected
+    dynamics = system.evaluate(t, state, accumulators, mode)
+
+    smooth, within = system.program is not None, (True, True)
+    if frozen:
+        smooth, within = ~mode.free, (True, ~mode.free)
+    elif system.has_margin_rates:
+        changed = tuple(a ^ b for a, b in zip(dynamics.words, point.words, strict=True))
+        within = valid_end_rates(dynamics.surfaces, changed, h)
+    rates = (point.signal_rates, dynamics.signal_rates)
+    segment = Segment(
+        *(point.sample, dynamics.signals.sample, h, request.grid),
+        shown_rates=lambda: (Shown.of(rates[0]), Shown.of(rates[1])),
+        sample_rates=lambda: rates,
+        smooth=smooth,
+        within=within,
+    )
+    updated = {name: Memory(z[1][name], o.update(accumulators[name], segment)) for name, o in system.objectives.items()}
+    if not loop.ticks and (loop.eventful or frozen):
+        # A step of length 0 must not count twice in the objectives.
+        updated = select(request.refresh, point.accumulators, updated)
+    end = _build_point(dynamics, t, projected, updated, forecast)
+    return Attempt(end, dynamics.signals, shift, report(dynamics, state, error))
+
+
+def commit_step(
+    system: LoopSystem,
+    point: Point,
+    attempt: Attempt,
+    clock: Clock,
+    triggered: Margins,
+    mode: Mode,
+    logs: list[PyTree],
+    forecast: Forecast,
+) -> Point:
+    """Return the point at which the run continues, after the events and the ticks at the end of a step.
+
+    In a loop without ticks a later step of length 0 (`StepRequest.refresh`) evaluates the rates after an event. Events
+    are rare, so this is cheaper than an evaluation after every step. `logs` are the rows that `advance` has taken out
+    of the state (`core.log`).
+    """
+    loop, end = system.loop, attempt.point
+    state = end.state
+    if loop.changes:
+        (values, rates), (last, last_rates) = point.recorded, end.recorded
+        passed = {
+            name: HermiteStep(point.t, end.t, (values[name], last[name]), (rates[name], last_rates[name]))
+            for name in values
+        }
+        lent = borrow(state, logs)
+        state = borrow(loop.change(clock, lent, attempt.signals, end.margins, triggered, passed), None)
+    if loop.ticks:
+        return evaluate_point(system, end.t, state, end.accumulators, mode, forecast)
+    return end._replace(state=state, words=end.words if mode.words is None else mode.words)
+
+
+def mode_in_step(system: LoopSystem, words: ModeBits, free: Bool) -> Mode:
+    """Return the mode of a step in which the comparisons keep the answers `words`.
+
+    Where it is `free`, each stage evaluates its comparisons, across switching surfaces.
+    """
+    all, none = jnp.uint32(0xFFFFFFFF), jnp.uint32(0)
+    return Mode(words, free, tuple(jnp.where(free, all, none) for _ in range(system.word_count)))
+
+
+def mode_after_changes(system: LoopSystem, words: ModeBits, number: Array, lands: Bool) -> Mode:
+    """Return the mode in which the dynamics are evaluated after the changes at the end of a step.
+
+    If it `lands` on the switching surface of a comparison, that one keeps its answer in `words`, those of
+    `flip_answer`: at the zero of its margin, rounding could turn it back. All others are evaluated.
+    """
+    frozen = (jnp.where(lands, bit, jnp.uint32(0)) for bit in single_bit(number, system.word_count))
+    return Mode(words, ~lands, tuple(~bit for bit in frozen))
+
+
+def flip_answer(system: LoopSystem, words: ModeBits, number: Array, lands: Bool) -> ModeBits:
+    """Return the answers with that of one comparison reversed where a step `lands` on its switching surface."""
+    bits = single_bit(number, system.word_count)
+    return tuple(word ^ jnp.where(lands, bit, jnp.uint32(0)) for word, bit in zip(words, bits, strict=True))
+
+
+def _build_point(
+    dynamics: Evaluation, t: Any, state: LoopState, accumulators: Accumulators, forecast: Forecast
+) -> Point:
+    signals = dynamics.signals
+    return Point(
+        *(t, state, accumulators, signals.sample, dynamics.signal_rates, (signals.recorded, dynamics.recorded_rates)),
+        *(dynamics.rates, dynamics.margins, dynamics.words, forecast(dynamics)),
+    )

@@ -1,0 +1,240 @@
+"""The dynamics of the loop and its objectives, as one function of time and state.
+
+Fixed steps evaluate the parts directly, unless switching surfaces are located. All other runs trace a program whose
+comparisons are visible (`comparisons`). Fixed steps on this program freeze a mode, and so do adaptive steps that are
+logged or replayed. Without a mode, the derivative of a step places a kink up to one step too early or too late.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.loop import Loop, LoopState, Margins, Signals
+from diffabs.core.protocols import Memory, Objective, Segment, Shown
+from diffabs.core.types import PyTree, Scalar
+from diffabs.engine.step.comparisons import SwitchedProgram
+from diffabs.engine.step.modes import ComparisonAnswers, Mode, ModeBits
+from diffabs.engine.step.surfaces import SwitchingFunction
+
+Objectives = dict[str, Objective]
+Accumulators = dict[str, Memory]
+
+UNCONSTRAINED = Mode(None)  # no frozen answers: every comparison is evaluated
+MAX_CACHED_SYSTEMS = 256  # greatest number of traced programs that are kept
+_traced: dict[PyTree, tuple[SwitchedProgram | None, str]] = {}
+
+
+class LoopEvaluation(NamedTuple):
+    """The dynamics at an instant.
+
+    Attributes:
+        rate: Rates of the loop's flow.
+        accumulator_rates: Rates of the objectives' integrals.
+        signals: Signals of the loop.
+        margins: Margins of the stop and of the blocks' events.
+    """
+
+    rate: PyTree
+    accumulator_rates: dict[str, PyTree]
+    signals: Signals
+    margins: Margins
+
+
+class Evaluation(NamedTuple):
+    """The dynamics at an instant within a mode, with the time derivatives that a step needs.
+
+    Attributes:
+        rates: Rates of the loop's flow and of the objectives' integrals.
+        signals: Signals of the loop.
+        margins: Margins of the stop and of the blocks' events.
+        words: Answers to the comparisons.
+        contradicted: Answers of the mode that the numbers contradict.
+        surfaces: Margins of the comparisons.
+        signal_rates: Rates of the sample, or of plant outputs and setpoint, or (), as the objectives need them.
+        recorded_rates: Rates of the signals that blocks record, by block.
+        margin_rates: Rates of the margins of stop and events; () if they were not evaluated.
+    """
+
+    rates: tuple[PyTree, PyTree]
+    signals: Signals
+    margins: Margins
+    words: ModeBits
+    contradicted: ModeBits
+    surfaces: list[SwitchingFunction]
+    signal_rates: PyTree
+    recorded_rates: dict[str, PyTree]
+    margin_rates: PyTree
+
+
+class LoopSystem(NamedTuple):
+    """A loop and its objectives, with the program of their dynamics.
+
+    Attributes:
+        program: The program with visible comparisons; None if the parts are evaluated directly.
+        loop: Loop with the parameters of the run.
+        objectives: Objectives by name.
+        signal_rates: Signals whose rates an evaluation has: "sample", "shown" (plant outputs and setpoint), or "".
+        has_margin_rates: True if an evaluation has the rates of all margins.
+    """
+
+    program: SwitchedProgram | None
+    loop: Loop
+    objectives: Objectives
+    signal_rates: str
+    has_margin_rates: bool
+
+    @property
+    def word_count(self) -> int:
+        """Number of words that hold the answers to the comparisons."""
+        return self.program.word_count if self.program else 0
+
+    @property
+    def bit_count(self) -> int:
+        """Number of bits that hold the answers to the comparisons; margins of events have the numbers after them."""
+        return self.program.bit_count if self.program else 0
+
+    def rates(self, t: Scalar, z: PyTree, held: PyTree, mode: Mode) -> PyTree:
+        """Return dz/dt at time `t` within a `mode`, with z and `held` as `split_flow_and_held` returns them."""
+        moving, fixed = (t, *z), (held, self.loop, self.objectives)
+        if self.program is None:
+            return _evaluate_rates(moving, fixed)
+        return self.program(lambda dynamics: dynamics[:2], moving, fixed, mode)
+
+    def list_margins(self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode) -> list[Scalar]:
+        """Return the margins of comparisons and then of events at time `t`, `state` and `accumulators` in a `mode`."""
+        z, held = split_flow_and_held(state, accumulators)
+        moving, fixed = (t, *z), (held, self.loop, self.objectives)
+        if self.program is None:
+            return jax.tree.leaves(_evaluate_loop(moving, fixed).margins)
+        # The rates are asked for, because they depend on all comparisons.
+        (margins, _), answers = self.program.look(
+            lambda dynamics: (dynamics.margins, dynamics[:2]), moving, fixed, mode
+        )
+        return [margin for _, margin in answers.margins] + jax.tree.leaves(margins)
+
+    def evaluate(self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode) -> Evaluation:
+        """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`."""
+        z, held = split_flow_and_held(state, accumulators)
+        fixed = (held, self.loop, self.objectives)
+
+        def look(t: Scalar, z: PyTree) -> tuple[LoopEvaluation, ComparisonAnswers]:
+            if self.program is None:
+                return _evaluate_loop((t, *z), fixed), ComparisonAnswers((), (), [])
+            return self.program.look(lambda dynamics: dynamics, (t, *z), fixed, mode)
+
+        def moving_signals(t: Scalar, z: object) -> tuple[PyTree, ComparisonAnswers]:
+            dynamics, answers = look(t, z)
+            sample = dynamics.signals.sample
+            shown = {"sample": sample, "shown": Shown.of(sample), "": ()}[self.signal_rates]
+            margins = (
+                (dynamics.margins, [margin for _, margin in answers.margins]) if self.has_margin_rates else ((), [])
+            )
+            return (shown, dynamics.signals.recorded, *margins), answers
+
+        dynamics, answers = look(t, z)
+        surfaces = [SwitchingFunction(*margin_pair) for margin_pair in answers.margins]
+        signal_rates, recorded_rates, margin_rates = (), dynamics.signals.recorded, ()
+        if self.signal_rates or self.has_margin_rates or self.loop.recorders:
+            # The derivative along (1, dz/dt) is the total time derivative on the trajectory.
+            along = (jnp.ones_like(t), dynamics[:2])
+            (_, _, _, values), moves, answers = jax.jvp(moving_signals, (t, z), along, has_aux=True)
+            signal_rates, recorded_rates, margin_rates, rates = moves
+            if self.has_margin_rates:
+                each = zip(answers.margins, values, rates, strict=True)
+                surfaces = [SwitchingFunction(numbers, value, rate) for (numbers, _), value, rate in each]
+        return Evaluation(
+            *(dynamics[:2], dynamics.signals, dynamics.margins, answers.words, answers.contradicted, surfaces),
+            *(signal_rates, recorded_rates, margin_rates),
+        )
+
+
+def build_system(
+    loop: Loop,
+    objectives: Objectives,
+    t: Scalar,
+    state: LoopState,
+    accumulators: Accumulators,
+    *,
+    switched: bool,
+    has_margin_rates: bool = False,
+) -> LoopSystem:
+    """Return the system of a loop. Its program is traced once for each structure and for arguments of these shapes.
+
+    Of time, state and accumulators only shapes and types matter. A `switched` program has visible comparisons; without
+    it the parts are evaluated directly.
+    """
+    z, held = split_flow_and_held(state, accumulators)
+    args = ((t, *z), (held, loop, objectives))
+    leaves, tree = jax.tree.flatten(args)
+    # `result_type(float)` is part of the key: with another precision the same shapes give another program.
+    key = (tree, tuple(map(jax.typeof, leaves)), jnp.result_type(float), switched)
+    traced = _traced.get(key)
+    if traced is None:
+        while len(_traced) >= MAX_CACHED_SYSTEMS:
+            _traced.pop(next(iter(_traced)), None)  # a dict keeps the order of insertion: the oldest goes first
+        # `counts`: only comparisons that influence rates or recorded signals produce a kink in the run.
+        program = (
+            SwitchedProgram(_evaluate_loop, *args, counts=lambda dynamics: (dynamics[:2], dynamics.signals.recorded))
+            if switched
+            else None
+        )
+        traced = _traced[key] = program, _find_asked_rates(loop, objectives, t, state, accumulators, smooth=switched)
+    return LoopSystem(traced[0], loop, objectives, traced[1], has_margin_rates)
+
+
+def _find_asked_rates(
+    loop: Loop, objectives: Objectives, t: Scalar, state: LoopState, accumulators: Accumulators, *, smooth: bool
+) -> str:
+    """Return the signals of a segment whose rates the objectives ask for, as `LoopSystem.signal_rates`."""
+    needed = set()
+
+    def note(kind: str, rates: object) -> tuple[PyTree, PyTree]:
+        needed.add(kind)
+        return rates, rates
+
+    def update(loop: Loop, objectives: Objectives, state: LoopState, accumulators: Accumulators, t: Scalar) -> PyTree:
+        sample = loop.signals(t, state).sample
+        segment = Segment(
+            *(sample, sample, t, t),
+            lambda: note("shown", Shown.of(sample)),
+            lambda: note("sample", sample),
+            smooth=t > 0 if smooth else False,
+        )
+        return {name: objective.update(accumulators[name], segment) for name, objective in objectives.items()}
+
+    jax.eval_shape(update, loop, objectives, state, accumulators, t)
+    return "sample" if "sample" in needed else "shown" if needed else ""
+
+
+def split_flow_and_held(state: LoopState, accumulators: Accumulators) -> tuple[PyTree, PyTree]:
+    """Return the integrated part of loop and objectives, and the part that is constant between two instants."""
+    flow = (state.flow(), {name: memory.flow for name, memory in accumulators.items()})
+    return flow, ([memory.held for memory in state[1:]], {name: memory.held for name, memory in accumulators.items()})
+
+
+def with_flow(state: LoopState, accumulators: Accumulators, flow: PyTree) -> tuple[LoopState, Accumulators]:
+    """Return state and accumulators with another integrated part, as `split_flow_and_held` returns it."""
+    return state.with_flow(flow[0]), {
+        name: memory._replace(flow=flow[1][name]) for name, memory in accumulators.items()
+    }
+
+
+def _evaluate_loop(moving: PyTree, fixed: PyTree) -> LoopEvaluation:
+    """Return the dynamics for (time, flow, accumulator flow) and ((held, accumulator held), loop, objectives)."""
+    (t, flow, tally_flow), ((held, tally_held), loop, objectives) = moving, fixed
+    state = LoopState(flow[0], *(Memory(*both) for both in zip(flow[1:], held, strict=True)))
+    accumulators = {name: Memory(tally_flow[name], tally_held[name]) for name in tally_flow}
+    signals = loop.signals(t, state)
+    rate = loop.flow(t, state, signals)
+    margins = loop.margins(t, state, signals, lambda: rate)
+    accumulator_rates = {
+        name: objective.flow(accumulators[name], signals.sample) for name, objective in objectives.items()
+    }
+    return LoopEvaluation(rate, accumulator_rates, signals, margins)
+
+
+@jax.jit  # traced and differentiated once for all stages of a step
+def _evaluate_rates(moving: object, fixed: object) -> PyTree:
+    """Return the rates of `_evaluate_loop`."""
+    return _evaluate_loop(moving, fixed)[:2]

@@ -1,0 +1,135 @@
+"""Figures of a tuning: convergence, runs before and after, and the front of two objectives."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from diffabs.core.types import PyTree, Scalar
+from diffabs.engine.types import Trajectory
+from diffabs.output.plot.style import (
+    COLOURS,
+    GREY,
+    Axes,
+    Figure,
+    control_label,
+    curve_style,
+    label_axes,
+    make_logarithmic,
+    sheet,
+    signal_label,
+)
+
+MARKS = "osD^v"
+MAX_DECADES = 5.0  # an objective that falls by less is easier to read on a linear axis
+SETTLED_MULTIPLE = 1.5  # length of the time axis, in transients
+
+
+def draw_tuning(
+    points: Sequence[PyTree], runs: Mapping[str, Trajectory], *, title: str = "", lane: str = "", unit: str = "N m"
+) -> Figure:
+    """Return the figure of `diffabs tune`: convergence above, the runs before and after below."""
+    figure, (objective, gradient, slip, torque) = sheet(2, 2, title=title, size=(5.8, 3.1))
+    _objective(objective, points)
+    _gradient(gradient, points)
+    _runs(slip, torque, runs, lane and f"worst lane: {lane}", unit)
+    return figure
+
+
+def draw_pareto(
+    fronts: Mapping[str, tuple[PyTree, PyTree]],
+    *,
+    marks: Mapping[str, tuple[float, float]] | None = None,
+    x: str = "effort [N² m² s]",
+    y: str = "stopping distance [m]",
+    title: str = "",
+) -> Figure:
+    """Return a figure of one objective over another, with the Pareto front of each set of points.
+
+    Both objectives are minimised, as in `pareto_front`. Points on a front are joined; the others are pale.
+
+    Args:
+        fronts: Points (x, y) by name, each coordinate an array of shape (n,).
+    """
+    figure, (ax,) = sheet(title=title, size=(6.2, 4.0))
+    for i, (name, (across, up)) in enumerate(fronts.items()):
+        across, up = np.asarray(across, float), np.asarray(up, float)
+        best = pareto_front(across, up)
+        ax.plot(across, up, "o", color=COLOURS[i % 7], alpha=0.25, markersize=4)
+        ax.plot(across[best], up[best], "o-", color=COLOURS[i % 7], markersize=5, label=name)
+    for i, (name, point) in enumerate((marks or {}).items()):
+        ax.plot([point[0]], [point[1]], MARKS[i % 5], color=COLOURS[(i + len(fronts)) % 7], markersize=8, label=name)
+    label_axes(ax, x, y)
+    return figure
+
+
+def pareto_front(x: Scalar, y: Scalar) -> np.ndarray:
+    """Return the indices of the Pareto-optimal points (both objectives are minimised), in ascending order of x.
+
+    A point is left out if another point is at least as small in both objectives. Of equal points one is kept. Points
+    that are not finite are left out.
+
+    Args:
+        x: First objective, shape (n,).
+        y: Second objective, shape (n,).
+    """
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    # In the order of x (of equal x the smallest y first), a point is on the front if its y is a new minimum.
+    order = [i for i in np.lexsort((y, x)) if np.isfinite([x[i], y[i]]).all()]
+    front, lowest = [], np.inf
+    for i in order:
+        if y[i] < lowest:
+            front.append(i)
+            lowest = y[i]
+    return np.array(front, int)
+
+
+def _objective(ax: Axes, points: Sequence[PyTree]) -> None:
+    """Draw the objective and, on an axis of its own, the largest violation of a constraint."""
+    n, values = [p.evaluations for p in points], np.array([p.objective for p in points])
+    ax.plot(n, values, "o-", markersize=3.5, color=COLOURS[0], label="objective")
+    finite = values[np.isfinite(values)]
+    if len(finite) and finite.min() > 0 and finite.max() > MAX_DECADES * finite.min():
+        make_logarithmic(ax, "y")
+    violation = np.array([p.violation for p in points])
+    if np.any(violation > 0):
+        right = ax.twinx()
+        right.spines[["top", "left"]].set_visible(False)
+        right.plot(n, violation, "--", color=COLOURS[1], linewidth=1.2)
+        right.set_ylabel("greatest violation [of its bound]", fontsize=10, color=COLOURS[1])
+        right.set_ylim(0, None)
+    label_axes(ax, "gradients computed", "objective", legend=False)
+
+
+def _gradient(ax: Axes, points: Sequence[PyTree]) -> None:
+    ax.plot([p.evaluations for p in points], [p.gradient for p in points], "o-", markersize=3.5, color=COLOURS[2])
+    make_logarithmic(ax, "y")
+    label_axes(ax, "gradients computed", "gradient, greatest component")
+
+
+def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str = "", unit: str = "N m") -> None:
+    """Draw the first signal (the slip of a brake) with its setpoint, and the control."""
+    for i, (name, trajectory) in enumerate(runs.items()):
+        t = np.asarray(trajectory.sample.t)
+        slip.plot(t, trajectory.sample.output[0], label=name, **curve_style(i))
+        torque.plot(t, trajectory.sample.control, label=name, linewidth=1.2, **curve_style(i))
+    first = next(iter(runs.values())).sample
+    slip.plot(np.asarray(first.t), first.setpoint, color=GREY, linewidth=0.9, linestyle=":", label="setpoint")
+    label_axes(slip, "time [s]", signal_label(first.output), title)
+    label_axes(torque, "time [s]", control_label(unit), legend=False)
+    for ax in (slip, torque):
+        ax.set_xlim(0, _arrival_time(runs))
+        ax.locator_params(axis="x", nbins=6)
+
+
+def _arrival_time(runs: Mapping[str, Trajectory]) -> float:
+    """Return the end of the time axis [s]: 1.5 times the longest transient, at most the longest run.
+
+    The transient of a run ends when its first signal stays within 2 % of its largest magnitude around the setpoint.
+    """
+    ends = []
+    for trajectory in runs.values():
+        t, slip = np.asarray(trajectory.sample.t), np.asarray(trajectory.sample.output[0])
+        away = np.flatnonzero(np.abs(slip - np.asarray(trajectory.sample.setpoint)) > 0.02 * np.max(np.abs(slip)))
+        ends.append(float(t[away[-1]]) if len(away) else 0.0)
+    whole = max(float(np.asarray(trajectory.sample.t)[-1]) for trajectory in runs.values())
+    return min(whole, SETTLED_MULTIPLE * max(ends)) or whole

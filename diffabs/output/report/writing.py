@@ -1,0 +1,72 @@
+"""Sections as one HTML file, which fetches nothing and contains no script."""
+
+import importlib.resources
+import pathlib
+from collections.abc import Callable, Sequence
+
+from diffabs import __version__
+from diffabs.host.values import make_printable
+from diffabs.output.report import experiments, findings, proofs, studies
+from diffabs.output.report.documents import Document, ReportError
+from diffabs.output.report.page import Section, shown_numbers
+
+MARK = b'<meta name="generator" content="diffabs report'  # near the start of every report
+MARK_WITHIN_BYTES = 1024  # length of the start of a file with the mark
+SECTION_BY_KIND: dict[str, Callable[[Document], Section]] = {
+    "reproduce": experiments.paper_section,
+    "sweep": studies.sweep_section,
+    "rare": studies.rare_section,
+    "tune": findings.tuning_section,
+    "identify": findings.identification_section,
+    "prove": proofs.box_section,
+    "design": proofs.design_section,
+    "certificate": proofs.certificate_section,
+}
+
+
+def build_report(documents: Sequence[Document], title: str = "") -> str:
+    """Return a report of documents as HTML, with one section each.
+
+    Args:
+        documents: Documents of the commands.
+        title: Title of the report; by default the title of the only section, or the number of results.
+
+    Raises:
+        ReportError: A document, or a file that belongs to it, cannot be read.
+    """
+    import jinja2
+
+    sections = [_section(document) for document in documents]
+    text = (importlib.resources.files("diffabs.output.report") / "report.html.j2").read_text(encoding="utf-8")
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters |= {"numbers": shown_numbers, "printable": make_printable}
+    whole = title or (sections[0].title if len(sections) == 1 else f"{len(sections)} results")
+    try:
+        return environment.from_string(text).render(title=whole, sections=sections, version=__version__)
+    except RecursionError:  # lists in lists
+        raise ReportError(
+            f"{', '.join(str(document.path) for document in documents)}: values are nested too deeply"
+        ) from None
+
+
+def _section(document: Document) -> Section:
+    try:
+        return SECTION_BY_KIND[document.kind](document)
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OSError) as error:
+        message = " ".join(f"{type(error).__name__} {error}".split())
+        raise ReportError(f"{document.path}: cannot be read as a document of {document.kind}: {message}") from None
+
+
+def is_report(path: pathlib.Path) -> bool:
+    """Return True for a file that is a report of diffabs, which another report may replace.
+
+    Args:
+        path: File to read.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    with path.open("rb") as file:
+        return MARK in file.read(MARK_WITHIN_BYTES)

@@ -1,0 +1,156 @@
+"""Objectives of a braking run: time, distance, locked wheel, effort of the brake."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.numerics import larger
+from diffabs.core.protocols import Ending, Memory, Sample, Segment
+from diffabs.core.pytree import param, pytree
+from diffabs.core.types import Scalar
+from diffabs.parts.objectives.tracking import FinalValue, HeldValue, Integral
+
+
+@pytree
+class StopTime(FinalValue):
+    """Time to the stop [s]: the time of the last sample, plus the time that the loop's stop extrapolates.
+
+    `Standstill` extrapolates to rest, v/a. A run that does not stop is extrapolated, too, with its last deceleration a
+    of at least 0.001 m/s^2. `NoStop` adds nothing.
+    """
+
+    unit = "s"
+    physical = (0.0, math.inf)
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Return the time of the last sample plus the remaining time [s]."""
+        del memory
+        return ending.sample.t + ending.time_left
+
+
+@pytree
+class StopDistance(FinalValue):
+    """Distance to the stop [m]: the distance of the last sample, plus the distance that the loop's stop extrapolates.
+
+    `Standstill` extrapolates to rest, v^2/(2 a). A run that does not stop is extrapolated, too, with its last
+    deceleration a of at least 0.001 m/s^2. So rolling on is never optimal. `NoStop` adds nothing.
+    """
+
+    unit = "m"
+    physical = (0.0, math.inf)
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Return the distance of the last sample plus the remaining distance [m]."""
+        del memory
+        return ending.sample.output.distance + ending.distance_left
+
+
+@pytree
+class LockedTime(HeldValue):
+    """Time [s] during which the slip exceeds `threshold`; 0 if the wheel never locks.
+
+    A root of the step's cubic locates each crossing.
+    """
+
+    unit = "s"
+    failure = 0.0  # a wheel that locks
+    physical = (0.0, math.inf)
+
+    threshold: Scalar = param(default=0.99, unit="1", above=0.0, below=1.0)
+    """Slip from which on the wheel counts as locked."""
+
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
+        """Return the sum with the part of the step above the threshold [s]."""
+        slip = segment.output(lambda output: output.slip).minus(self.threshold)
+        above, below, root = slip.start > 0, slip.end <= 0, slip.root()
+        part = jnp.where(above, jnp.where(below, root, 1.0), jnp.where(below, 0.0, 1.0 - root))
+        return memory.held + part * segment.h
+
+
+@pytree
+class Effort(Integral):
+    """Integral of u^2 dt, where u is the actuator's output, in the square of its unit times s; for a torque [N^2 m^2
+    s].
+    """
+
+    unit = "control^2 s"
+    physical = (0.0, math.inf)
+
+    def flow(self, memory: Memory, sample: Sample) -> Scalar:
+        """Return u^2."""
+        del memory
+        return sample.control**2
+
+
+class Varied(NamedTuple):
+    """Memory of `Variation` and of `TorqueRate`.
+
+    Attributes:
+        total: Total variation, or greatest rate, up to the end of the last step.
+        last: Control at the end of the last step.
+        way: Sign of the control's last change.
+    """
+
+    total: Scalar
+    last: Scalar
+    way: Scalar
+
+
+@pytree
+class Variation(HeldValue):
+    """Total variation of the control, a brake's torque [N m]: the integral of |du| along the run, with jumps. It
+    measures chattering.
+    """
+
+    unit = "control"
+    physical = (0.0, math.inf)
+    counts_kinks = True
+
+    def start(self, sample: Sample) -> Memory:
+        """Return the memory with the first control and variation 0."""
+        return Memory(held=Varied(0.0 * sample.control, sample.control, 0.0 * sample.control))
+
+    def update(self, memory: Memory, segment: Segment) -> Varied:
+        """Return the sum with the jump before the step and the variation inside it, with both sides of an extremum."""
+        total, last, way = memory.held
+        u = segment.sample(lambda sample: sample.control)
+        top, bottom = u.greatest(), -u.times(-1.0).greatest()
+        # A step of zero length, before an event, has no rise: the sign of the rate gives the direction in which its end
+        # moves with the event.
+        up = jnp.where(u.start == u.end, segment.sample_rates()[0].control > 0, u.end > u.start)
+        low, high = jnp.where(up, u.start, u.end), jnp.where(up, u.end, u.start)
+        beyond = jnp.where(top > high, top - high, 0.0) + jnp.where(bottom < low, low - bottom, 0.0)
+        # A jump of 0 still has a tangent when the step's two values move apart. It then belongs to the change before it
+        # and takes the sign of this change.
+        jump, rise = jax.lax.stop_gradient((u.start - last, u.end - u.start))
+        way = jnp.where(jump != 0, jnp.sign(jump), way)
+        total += way * (u.start - last) + (high - low) + 2.0 * beyond
+        return Varied(total, u.end, jnp.where(rise != 0, jnp.sign(rise), way))
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Return the total variation."""
+        del ending
+        return memory.held.total
+
+
+@pytree
+class TorqueRate(HeldValue):
+    """Greatest |du/dt| of the actuator's output u at the instants of the integration, for a torque [N m/s].
+
+    A jump counts as its height divided by the grid's step, so it depends on the step. An actuator with a lag has no
+    jumps.
+    """
+
+    unit = "control/s"
+    physical = (0.0, math.inf)
+
+    start, value = Variation.start, Variation.value
+
+    def update(self, memory: Memory, segment: Segment) -> Varied:
+        """Return the greatest rate up to the step's end, from the jump before the step and the rates at its ends."""
+        greatest, last, way = memory.held
+        jump = jnp.abs(segment.start.control - last) / segment.step
+        rates = (jnp.abs(rate.control) for rate in segment.sample_rates())
+        return Varied(larger(larger(greatest, jump), larger(*rates)), segment.end.control, way)

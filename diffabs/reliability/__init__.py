@@ -1,6 +1,0 @@
-"""Probabilities of rare failures: subset simulation, importance sampling, design points. Needs the extra `sweep`."""
-
-from diffabs.reliability.failure import failure_probability as failure_probability
-from diffabs.reliability.importance_sampling import ProbabilityEstimate as ProbabilityEstimate
-from diffabs.reliability.subset_simulation import RareEvent as RareEvent
-from diffabs.reliability.subset_simulation import subset_simulation as subset_simulation
