@@ -173,6 +173,7 @@ def test_table_shows_units():
     assert units == {name: registry.unit_of(part) for name, part in BRAKING.items()}
 
 
+@pytest.mark.slow
 def test_diverged_could_not_be_done():
     blow_up = ("--set", "controller=constant-torque", "--set", "controller.torque=-1e308")
     result = run("simulate", "slip-lmi", *SHORT, *blow_up, "--json", status=1)

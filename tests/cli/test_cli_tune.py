@@ -17,6 +17,7 @@ import pytest
 from commands import assert_one_error_line, left_in, run, umask
 from invented import HISTORY
 from invented import tuned as invention
+from marks import cases
 from mutants import killed_by
 from seams import replace_seam
 from small_scenarios import TUNE as SMALL
@@ -327,7 +328,7 @@ def test_a_decay_that_is_asked_for_is_certified(tmp_path):
     assert after["over"] == document["certificate"]["over"]
 
 
-@pytest.mark.parametrize("name", ["slip-lmi", "slip-estimator", "slip-cured"])
+@pytest.mark.parametrize("name", cases(["slip-cured", "slip-lmi", "slip-estimator"], "slip-lmi", "slip-estimator"))
 def test_packaged_scenarios_can_be_tuned(name, invented):
     """The library is asked something that fits: it has checked the problem that it built."""
     run("tune", name, "--set", "tune.decay=0", "--set", "tune.damping=0", "--set", "tune.limits={}")

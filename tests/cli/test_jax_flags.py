@@ -27,5 +27,6 @@ def flags():
 
 
 @killed_by("cli.main", 'jax.config.update(f"jax_{flag}", value)', "pass")
+@pytest.mark.slow
 def test_a_command_runs_under_flags_for_debugging(file, flags):
     assert '"diverged": false' in run("simulate", file(TUNE), "--json").stdout

@@ -4,7 +4,6 @@ import jax
 import numpy as np
 import pytest
 import sliding
-from marks import cases
 from mutants import killed_by
 from signals import close, seen
 
@@ -24,10 +23,8 @@ def iae(numbers, solver, tracking_time=0.01):
     return d.measure(loop, solver, {"iae": IAE()}).metrics["iae"]
 
 
-@killed_by("parts.controllers.antiwindup", "smaller(0.0 * error, error), larger(0.0 * error, error)", "-1e9, 1e9")
-@pytest.mark.parametrize(
-    "solver", cases([d.FixedStep(1e-2, 10.0), d.Adaptive(1e-6, 10.0, 1e-2)], d.Adaptive(1e-6, 10.0, 1e-2))
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_value_and_derivatives_are_those_of_filippovs_solution(solver):
     """Of order Tt^2: at Tt = 10 ms the value is off by 1.3e-5, and the derivatives by at most 1e-3."""
     value, slopes = iae(AT, solver), jax.jacfwd(lambda at: iae(at, solver))(AT)
@@ -50,6 +47,7 @@ def test_reverse_mode_and_a_kernel_agree_with_forward_mode():
         np.testing.assert_allclose(found, exact, rtol=3e-5, err_msg=engine)
 
 
+@killed_by("parts.controllers.antiwindup", "smaller(0.0 * error, error), larger(0.0 * error, error)", "-1e9, 1e9")
 def test_the_rate_lies_between_zero_and_the_error():
     law = Clamping(tracking_time=0.1)
     # error, gain, excess of the output over its limit; I' = e - excess/(gain Tt)

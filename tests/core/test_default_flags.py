@@ -107,6 +107,7 @@ def test_loops_compute_the_same(strict, usual):
     jax.tree.map(np.testing.assert_array_equal, run_all(), usual)
 
 
+@pytest.mark.slow
 def test_linear_quadratic_design(strict):
     """The double integrator with unit weights has the gain (1, sqrt(3))."""
     gain = d.linear.lqr(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.eye(2), np.eye(1)).gain

@@ -95,7 +95,9 @@ def same(out: Any) -> Any:
     case="a contrary",
 )
 @killed_by("engine.step.comparisons", "asks = name if moves and real", "asks = name if real", case="of what is fixed")
-@pytest.mark.parametrize("name", cases(KINKED, "in a loop", "in one of three", "a conditional", "many"))
+@pytest.mark.parametrize(
+    "name", cases(KINKED, "in a loop", "in one of three", "a conditional", "many", "the least of columns", "vector")
+)
 def test_a_program_is_the_function(name):
     f, count = KINKED[name]
     one = program(f)

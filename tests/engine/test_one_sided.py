@@ -238,7 +238,10 @@ def warned(subject, free, batch=None):
 
 
 @pytest.mark.parametrize(
-    "name", cases(POINTS, "relay", "sampled relay", "torque", "delay", "delay, steps", "gain", "gain, constant")
+    "name",
+    cases(
+        POINTS, "relay", "sampled relay", "torque", "delay", "delay, steps", "gain", "gain, constant", "delay, period"
+    ),
 )
 def test_points_with_one_side_are_named(name):
     loop, paths, said = POINTS[name]

@@ -88,6 +88,7 @@ def test_random_scenario_agrees_with_scipy(seed):
 
 
 @killed_by("parts.plants.lab_rig", "stuck = jnp.where(held, smaller(needed, capacity), capacity)", "stuck = capacity")
+@pytest.mark.slow
 def test_lab_rig_locks_and_stops_like_scipy():
     plant = plants.LabRig()
     loop = braking(

@@ -152,7 +152,11 @@ class Waking(ShownState):
 @pytest.mark.parametrize("rtol", cases([1e-5, 1e-8, 1e-11], 1e-5, 1e-11))
 def test_a_state_that_is_zero_until_a_comparison_changes(rtol):
     """Heat is jump s + slope s^2/2 a time s after the change; its integral up to the end is the IAE of a setpoint 0."""
-    parts = {"reference": references.Setpoint(value=0.0), "controller": controllers.PID(kp=0.0), "stop": stops.NoStop()}
+    parts = {
+        "reference": references.Setpoint(value=0.0),
+        "controller": controllers.ConstantTorque(torque=0.0),
+        "stop": stops.NoStop(),
+    }
     loop = d.Loop(plant=Waking(), initial=CoastStart(speed=1.0), **parts)
     wakes, slope, jump = (x.ravel() for x in np.meshgrid([0.3, 0.5, 1 / 1.3], [1e-3, 1.0, 1e6], [0.0, 1e-3, 1e3]))
     batch = d.Batch({"plant.wakes": wakes, "plant.slope": slope, "plant.jump": jump})

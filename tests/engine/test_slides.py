@@ -81,6 +81,7 @@ def check_random(count, seed, solver):
     return slides
 
 
+@killed_by("engine.step.slides", "returns >= MAX_RETURNS", "returns > 1000")
 @pytest.mark.slow
 def test_random_switched_loops_slide_where_scipy_says_so():
     assert 5 <= check_random(24, 1, FIXED) <= 20
@@ -139,7 +140,6 @@ SLIDING = {
 }
 
 
-@killed_by("engine.step.slides", "returns >= MAX_RETURNS", "returns > 1000", case="dry friction")
 @pytest.mark.parametrize("name", cases(SLIDING, "bang-bang law", "actuator", "textbook anti-windup"))
 def test_a_sliding_run_has_no_derivative_and_says_so(name):
     """Its value with fixed steps stays, in both modes."""

@@ -105,6 +105,7 @@ def test_a_discontinuity_of_a_field_is_detected():
     assert d.switches(fall, 0.0, (1.0, 0.0), {"gravity": GRAVITY}) == []
 
 
+@pytest.mark.slow
 def test_an_opened_function_is_where_it_is_called():
     found = d.switches(lambda t, y, args: jnp.max(y) * jnp.arctan2(y, 1.0 - t), 0.0, jnp.ones(2))
     assert [one.operation for one in found] == ["max", "ge"]

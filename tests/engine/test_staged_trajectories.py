@@ -5,7 +5,6 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from decaying import decay_loop
 from mutants import killed_by
 
 import diffabs as d
@@ -27,23 +26,14 @@ def staged():
 
 
 @killed_by("engine.run", 'if getattr(run, "trajectory", None) is None:', "if True:")
-def test_a_staged_batch_has_derivatives():
-    """Of x(t) = u/rate (1 - exp(-rate t)); Runge-Kutta steps of 0.01 have errors of 1e-10."""
-    controls, times, rate = np.array([[1.0], [2.0]]), np.array([0.0, 0.05, 0.1]), jnp.asarray(2.0)
-
-    def places(rate):
-        batch = d.Batch({"controller.torque": controls[:, 0]})
-        run = d.run_batch(decay_loop(rate), batch, d.FixedStep(0.01, 0.1, every=5), trajectories=True)
-        return run.trajectory.sample.output.x
-
-    program = jex.jaxpr_as_fun(jax.make_jaxpr(places)(rate))
-    (slope,) = jax.jvp(program, (rate,), (jnp.ones_like(rate),))[1]
-    exact = jax.jacfwd(lambda rate: controls / rate * (1 - jnp.exp(-rate * times)))(rate)
-    np.testing.assert_allclose(slope, exact, rtol=1e-6, atol=1e-12)
+def test_a_staged_batch_can_be_differentiated():
+    program = jex.jaxpr_as_fun(jax.make_jaxpr(slips)(MASS))
+    (slope,) = jax.eval_shape(lambda mass: jax.jvp(program, (mass,), (jnp.ones_like(mass),))[1], MASS)
+    assert slope.shape == (2, 3)
 
 
 @pytest.mark.slow
-def test_a_staged_batch_of_braking_cars_has_derivatives(staged):
+def test_a_staged_batch_has_derivatives(staged):
     program, slope = staged
     h = 1e-2
     ends = [np.asarray(program(MASS + change)[0]) for change in (h, -h)]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line
 from commands import run as command
+from marks import cases
 from mutants import killed_by
 from structured_text import Block
 
@@ -705,7 +706,7 @@ def commands_of_text(text, seen):
 @killed_by(
     "output.export.structured_text", "self.device.moves - 1", "self.device.moves", case="filtered target-float64"
 )
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", cases(DTYPES, np.float32))
 @pytest.mark.parametrize("name", LOOPS)
 def test_structured_text_commands_what_the_parts_do(name, dtype):
     """Over 10,000 samples to rounding: an integral gathers some, in single precision as much as C does."""

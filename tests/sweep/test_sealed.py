@@ -10,6 +10,7 @@ import shutil
 import numpy as np
 import pytest
 from commands import assert_one_error_line, run
+from marks import cases
 from mutants import killed_by
 from sweeping import SCENARIO
 
@@ -152,7 +153,14 @@ def test_a_chunk_that_is_there_twice(copy, whole):
     assert as_read(copy) == as_read(whole / "out")
 
 
-@pytest.mark.parametrize("name", ["part-00000005-{}.parquet", "merged.parquet", "part-1.parquet", "notes.txt"])
+@pytest.mark.parametrize(
+    "name",
+    cases(
+        ["part-00000005-{}.parquet", "merged.parquet", "part-1.parquet", "notes.txt"],
+        "merged.parquet",
+        "part-1.parquet",
+    ),
+)
 def test_a_stray_file_makes_nothing_interrupted(copy, whole, name):
     """A number beyond the last, or a name of no chunk: it is not read, and that is said."""
     path = chunk_files(copy)[4]

@@ -324,6 +324,7 @@ def test_a_report_of_somebody_else_is_left_alone(file, swept, tmp_path):
 
 
 @killed_by("cli.show_samples", "    if scenario.seed:", "    if False:")
+@pytest.mark.slow
 def test_the_seed_of_a_single_run_has_no_effect_and_that_is_said(file, tmp_path):
     changes = ("--set", "solver.seed=5", "--set", "sweep.samples=2", "--set", "sweep.check=0")
     result = run("sweep", file(SMALL), "--out", tmp_path / "out", *changes)
@@ -364,7 +365,7 @@ def test_xla_computes_a_chunk_on_each_core(study, swept, tmp_path, monkeypatch):
 
 
 @killed_by("uncertainty.sweep.runner", "np.arange(self.size) < len(block.lanes)", "True")
-@pytest.mark.parametrize("chunk", [2, 4096])
+@pytest.mark.parametrize("chunk", cases([2, 4096], 4096))
 def test_copies_that_fill_a_block_do_not_run(study, monkeypatch, chunk):
     """Three samples are three runs, whatever the size of a chunk."""
     runs = []

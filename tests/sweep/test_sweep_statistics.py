@@ -668,7 +668,12 @@ class TestCoverage:
         "value = len(x), ordered[-1]",
     )
     @pytest.mark.parametrize(
-        "law", [stats.uniform(), stats.expon(), stats.norm()], ids=["uniform", "exponential", "normal"]
+        "law",
+        [
+            pytest.param(stats.expon(), id="exponential"),
+            pytest.param(stats.uniform(), id="uniform", marks=pytest.mark.slow),
+            pytest.param(stats.norm(), id="normal", marks=pytest.mark.slow),
+        ],
     )
     def test_replicates_of_stratified_samples(self, law):
         """Sobol' replicates in one dimension: one sample in each of 64 strata of equal probability. The mean of the

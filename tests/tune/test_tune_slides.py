@@ -1,5 +1,6 @@
 """A tuning that comes to runs that slide ends beside them, and says so."""
 
+import pytest
 import sliding
 from mutants import killed_by
 
@@ -15,6 +16,7 @@ END = 3.0
 
 
 @killed_by("tune.descent", "bool(evaluation.evaluation.slid > 0)", "False")
+@pytest.mark.slow
 def test_a_search_ends_beside_sliding_runs():
     """A block with speed 1 and dry friction F is at rest from t = 1/F on, so a run slides if F > 1/END.
 
