@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from diffabs.parts import stops as stops
     from diffabs.robust import design as design
     from diffabs.robust import reach as reach
+    from diffabs.scenario.proofs import prove_box as prove_box
+    from diffabs.scenario.proofs import verify as verify
     from diffabs.scenario.registry import register_parts as register_parts
     from diffabs.scenario.scenario import load as load
     from diffabs.uncertainty import sweep as sweep

@@ -11,15 +11,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from diffabs.cli import certificates, console, prove, show, targets
+from diffabs.cli import certificates, console, show, show_proofs, targets
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
 from diffabs.host import provenance
+from diffabs.host.process import core_count
 from diffabs.scenario import proving
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
     from diffabs.robust.design.loop_task import ProofTask
+    from diffabs.scenario.proofs import Verification
 
 CHECK = "check it with: diffabs verify"
 
@@ -89,7 +91,7 @@ def certify(
             console.conclude(f"{setup.name}: {reason}")
 
 
-def verify(
+def verify_file(
     file: Annotated[
         pathlib.Path, typer.Argument(metavar="FILE.json", help="Certificate written by design, certify or prove.")
     ],
@@ -106,30 +108,46 @@ def verify(
 
     The code is independent of the code that made the certificate.
     Exit status: 0 proved, or not refuted where --share leaves cells unchecked; 1 not proved, 2 no certificate."""
-    from diffabs.robust.design.verify import verify_file as verified
+    from diffabs.scenario.proofs import verify
 
     with console.end_on_errors():
         if not 0 < seconds < math.inf:
             console.fail(f"--seconds = {seconds:g} is outside (0, inf) s")
         if not 0 < share <= 1:
             console.fail(f"--share = {share:g} is outside (0, 1]")
-        if document := prove.read_proof_file(file):
-            prove.verify_proof_file(file, document, share, as_json)
-            raise typer.Exit
+        far = [""]
         try:
-            verdicts = console.run_with_progress(lambda: verified(file, seconds), f"verifying {file}")
+            verification = console.run_with_progress(
+                lambda: verify(
+                    file, share=share, seconds=seconds, progress=lambda line: far.__setitem__(0, line),
+                    processes=core_count(),
+                ),
+                f"verifying {file}",
+                lambda: far[0],
+            )  # fmt: skip
+        except ModuleNotFoundError:
+            console.need_extra("proof")
+            raise
         except ValueError as error:
             console.fail(f"{file}: {' '.join(str(error).split())}")
-        proved = bool(verdicts) and not any(verdict.reason for verdict in verdicts)
-        show.show_verification({
-            "file": str(file),
-            "proved": proved,
-            "claims": [{**verdict._asdict(), "proved": not verdict.reason} for verdict in verdicts],
-            "versions": provenance.versions(),
-        }, as_json)  # fmt: skip
-        if not proved:
-            why = "; ".join(f"{verdict.kind}: {verdict.reason}" for verdict in verdicts if verdict.reason)
-            console.conclude(f"{file}: not proved: {why or 'the file has no claims'}")
+        show.show_verification(_verification_document(file, verification), as_json)
+        if verification.reason:
+            console.conclude(f"{file}: not proved: {verification.reason}")
+        if verification.scenario and not as_json:
+            box_words = show_proofs.describe_box(verification.over, verification.scenario, digits=9)
+            where = "" if verification.complete else "in the cells proved again only: "
+            console.say(f"{where}for every {box_words} of the scenario in the file, whatever its title says")
+
+
+def _verification_document(file: pathlib.Path, verification: "Verification") -> JsonObject:
+    """Return the JSON document; that of a proof over a box has the box and its scenario, too."""
+    proved, box = verification.proved, {}
+    if verification.scenario:
+        over = {path: list(ends) for path, ends in verification.over.items()}
+        box = {"complete": proved and verification.complete, "scenario": verification.text, "over": over}
+    claims = [{**verdict._asdict(), "proved": not verdict.reason} for verdict in verification.claims]
+    versions = provenance.versions(*(["numpy"] if box else []))
+    return {"file": str(file), "proved": proved, **box, "claims": claims, "versions": versions}
 
 
 def _prepare(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from diffabs.cli import console, prove
+from diffabs.cli import console
 from diffabs.host import interrupt
 from diffabs.host.values import ScenarioError
 from diffabs.scenario.proving import certify_result
@@ -83,11 +83,13 @@ def _open_socket(port: int | None) -> socket.socket:
 def load_judge(path: pathlib.Path) -> "Callable[[Session], ProofVerdict]":
     """Return the function that judges a session by a proof's file."""
     from diffabs.output.explore.proved import judge_values, load_proved_box
+    from diffabs.scenario.proofs import read_proof_document
 
-    document = prove.read_proof_file(path)
-    if document is None:
-        console.fail(f"--proof {path}: {'is no certificate of prove' if path.exists() else 'there is no such file'}")
     try:
+        document = read_proof_document(path)
+        if document is None:
+            why = "is no certificate of prove" if path.exists() else "there is no such file"
+            console.fail(f"--proof {path}: {why}")
         return partial(judge_values, load_proved_box(path, document))
     except ValueError as error:
         console.fail(f"--proof {path}: {' '.join(str(error).split())}")

@@ -1,7 +1,6 @@
 """The command `prove`: bounds of all runs of a box of parameters, of the nonlinear loop with its limits."""
 
 import functools
-import json
 import math
 import pathlib
 from collections.abc import Sequence
@@ -13,20 +12,16 @@ import typer
 from diffabs.cli import console, show_proofs, targets
 from diffabs.cli import show as views
 from diffabs.core.types import JsonObject
-from diffabs.host import files, provenance
-from diffabs.host.process import core_count
 from diffabs.host.separated import read_decimal
 from diffabs.host.values import ScenarioError, format_given, unknown_name_error
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
-from diffabs.scenario.scenario import Scenario, dump, loads
+from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
     from diffabs.output.plot.proofs import ProofMap
-    from diffabs.robust.reach import BoxProof, RunClaim
+    from diffabs.robust.reach import RunClaim
     from diffabs.robust.reach.equations import Equations
-    from diffabs.robust.reach.extremes import ExtremeRuns
-
-MOST_BYTES = 2**28  # of a file that is read; some million cells
+    from diffabs.scenario.proofs import Proof
 
 
 def prove(
@@ -60,9 +55,9 @@ def prove(
             console.fail(f"--budget = {budget:g} is outside (0, inf) s")
         targets.check_picture(plot)
         from diffabs.compiler.runtime.toolchain import NoCompiler
-        from diffabs.robust.reach import NoRule, prove_box
+        from diffabs.robust.reach import NoRule
         from diffabs.robust.reach.equations import derive_equations
-        from diffabs.robust.reach.extremes import find_extreme_runs
+        from diffabs.scenario.proofs import prove_box
 
         setup = console.load_scenario(scenario, changes or (), integrated=False)
         sides = _read_sides(over, setup)
@@ -73,18 +68,15 @@ def prove(
             raise ScenarioError(
                 f"--claim is needed: the plant has no slip; it has {', '.join(setup.loop.plant.shows._fields)}"
             )
-        signals = ("slip",) if "slip" in setup.loop.plant.shows._fields else ()
         far = [""]
         with targets.new_target_file(plot, "--plot") as picture:
             with targets.new_target_file(out, "--out") as file:
                 try:
                     equations = derive_equations(setup.loop, box)  # refuses before anything is simulated
                     claims = [_read_claim(text, setup, equations) for text in claim or ()]
-                    extremes = find_extreme_runs(setup.loop, setup.solver, box)
                     proof = console.run_with_progress(
                         lambda: prove_box(
-                            setup.loop, box, claims, signals=signals, horizon=setup.solver.duration, budget=budget,
-                            extremes=extremes.ranges, suspects=extremes.points,
+                            setup.loop, setup.solver, box, claims, budget,
                             progress=lambda line: far.__setitem__(0, line),
                         ),
                         f"proving {setup.name}",
@@ -92,19 +84,17 @@ def prove(
                     )  # fmt: skip
                 except (NoRule, NoCompiler) as error:
                     raise ScenarioError(str(error)) from None
-                result = _document(proof, setup, box, claims, extremes.ranges)
+                result = _document(proof, setup)
                 show_result = functools.partial(_show, result, setup, as_json)
                 if file:
-                    from diffabs.robust.reach.certificate import certificate_document
-
                     with console.show_before_errors(show_result):
-                        file.write_text(json.dumps(certificate_document(proof, dump(setup), box, claims)) + "\n")
+                        proof.save(file, setup)
             result["files"] = {"certificate": str(out)} if out else {}
             if picture:
                 from diffabs.output.plot.proofs import draw_proof
 
                 with console.show_before_errors(show_result):
-                    shown = _map_of_proof(proof, setup, sides, claims, extremes)
+                    shown = _map_of_proof(proof, setup, sides)
                     console.run_with_progress(lambda: draw_proof(shown).savefig(picture), "drawing")
                 result["files"] |= {"plot": str(plot)}
         show_result()
@@ -114,70 +104,6 @@ def prove(
 
 def _show(result: JsonObject, scenario: Scenario, as_json: bool) -> None:
     views.as_json(result) if as_json else show_proofs.show_box_proof(result, scenario)
-
-
-def read_proof_file(file: pathlib.Path) -> JsonObject | None:
-    """Return the content of a file that `prove` wrote, None for any other file."""
-    try:
-        document = json.loads(files.read_content(file, MOST_BYTES))
-    except (OSError, ValueError, RecursionError):
-        return None
-    is_proof = isinstance(document, dict) and str(document.get("format", "")).startswith("diffabs box proof")
-    return document if is_proof else None
-
-
-def verify_proof_file(file: pathlib.Path, document: JsonObject, share: float, as_json: bool) -> None:
-    """Check a file of `prove` by the checker, show the verdict, and exit with status 1 if it fails.
-
-    `share` of its cells are checked, in (0, 1].
-    """
-    console.need_extra("proof")
-    from diffabs.robust.reach import NoRule
-    from diffabs.robust.reach.equations import derive_equations
-    from diffabs.robust.reach.extremes import find_extreme_runs
-    from diffabs.robust.reach.verification import read_proof, verify_box
-
-    far = [""]
-    try:
-        text = document.get("scenario")
-        if not isinstance(text, str):
-            raise ValueError("scenario is missing or no text; the TOML text of a scenario is needed")
-        scenario = loads(text.encode(), file.stem, "scenario", integrated=False)
-        box = read_proof(document).over
-        derive_equations(scenario.loop, box)  # refuses a loop or a box without rules before anything is simulated
-        # The runs that would show a false bound are looked for, and their cells are proved again.
-        extremes = find_extreme_runs(scenario.loop, scenario.solver, box)
-        verification = console.run_with_progress(
-            lambda: verify_box(
-                scenario.loop, scenario.solver.duration, document, share, suspects=extremes.points,
-                extremes=extremes.ranges, progress=lambda line: far.__setitem__(0, line), processes=core_count(),
-            ),
-            f"verifying {file}",
-            lambda: far[0],
-        )  # fmt: skip
-    except (NoRule, ValueError) as error:
-        console.fail(f"{file}: {' '.join(str(error).split())}")
-    proved, whole = not verification.reason, verification.checked == verification.cells
-    cells = f"{verification.checked:,} of {verification.cells:,} cells proved again"
-    cells += "; --share 1 proves all" if proved and not whole else ""
-    views.show_verification({
-        "file": str(file),
-        "proved": proved,
-        "complete": proved and whole,
-        "scenario": document["scenario"],
-        "over": {path: list(ends) for path, ends in box.items()},
-        "claims": [
-            {"kind": statement, "says": cells, "reason": verification.reason, "proved": proved}
-            for statement in verification.statements
-        ],
-        "versions": provenance.versions("numpy"),
-    }, as_json)  # fmt: skip
-    if verification.reason:
-        console.conclude(f"{file}: not proved: {verification.reason}")
-    if not as_json:
-        box_words = show_proofs.describe_box(box, scenario, digits=9)
-        where = "" if whole else "in the cells proved again only: "
-        console.say(f"{where}for every {box_words} of the scenario in the file, whatever its title says")
 
 
 def _describe_claim(claim: "RunClaim") -> str:
@@ -235,22 +161,19 @@ def _choose_axes(sides: Sequence[_Side]) -> list[int]:
     return wide
 
 
-def _map_of_proof(
-    proof: "BoxProof", scenario: Scenario, sides: Sequence[_Side], claims: Sequence["RunClaim"],
-    extremes: "ExtremeRuns",
-) -> "ProofMap":  # fmt: skip
+def _map_of_proof(proof: "Proof", scenario: Scenario, sides: Sequence[_Side]) -> "ProofMap":
     """Return the map of the first claim's quantity, else of the greatest slip, in the units of the given ranges."""
     from diffabs.output.plot.proofs import ProofMap
 
-    axes = _choose_axes(sides)
+    axes, claims, extremes, cover = _choose_axes(sides), proof.claims, proof.extremes, proof.cover
     scales = np.array([sides[i].scale for i in axes])
     quantity = claims[0].quantity if claims else "greatest slip"
     word, _, signal = quantity.rpartition(" ")
     bounds = np.empty(0)
-    if proof.rows is not None:
-        times = {"stop_time": proof.rows.time, "stop_distance": proof.rows.distance}
-        columns = proof.rows.lower if word == "least" else proof.rows.upper
-        bounds = columns[:, proof.prover.signals.index(signal)] if word else times[quantity][:, 1]
+    if cover.rows is not None:
+        times = {"stop_time": cover.rows.time, "stop_distance": cover.rows.distance}
+        columns = cover.rows.lower if word == "least" else cover.rows.upper
+        bounds = columns[:, cover.prover.signals.index(signal)] if word else times[quantity][:, 1]
     kind = "lower" if word == "least" else "upper"
     statement = f": {_describe_claim(claims[0])}" if claims else ""
 
@@ -261,10 +184,10 @@ def _map_of_proof(
     return ProofMap(
         labels=[sides[i].label for i in axes],
         box=shown_cells(np.array([side.ends for side in sides])),
-        cells=shown_cells(proof.cells),
+        cells=shown_cells(cover.cells),
         bounds=bounds,
-        undecided=shown_cells(proof.undecided),
-        refuting=None if proof.refuting is None else shown_cells(proof.refuting),
+        undecided=shown_cells(cover.undecided),
+        refuting=None if cover.refuting is None else shown_cells(cover.refuting),
         worst=None if worst is None else np.array(worst)[axes] * scales,
         worst_value=extremes.ranges[quantity][1] if quantity in extremes.ranges else None,
         quantity=f"proved {kind} bound of {signal.replace('_', ' ')} [{_unit_of(quantity, scenario)}]",
@@ -304,11 +227,9 @@ def _unit_of(quantity: str, scenario: Scenario) -> str:
     return units.get(quantity.split()[-1], "")
 
 
-def _document(
-    proof: "BoxProof", scenario: Scenario, box: dict[str, tuple[float, float]], claims: Sequence["RunClaim"],
-    extremes: dict[str, tuple[float, float]],
-) -> JsonObject:  # fmt: skip
+def _document(proof: "Proof", scenario: Scenario) -> JsonObject:
     """Return the JSON document; a bound that is not proved is null."""
+    cover, box, extremes = proof.cover, proof.over, proof.extremes.ranges
     bounds = {}
     for name, (low, high) in proof.bounds.items():
         row = {"low": low, "high": high, "unit": _unit_of(name, scenario)}
@@ -318,32 +239,32 @@ def _document(
             bounds[name]["worst_run"] = worst
             bounds[name]["looseness"] = (high - worst) / worst if worst and math.isfinite(high) else None
     widths = np.array([high - low for low, high in box.values()])
-    shares = ((proof.undecided[:, :, 1] - proof.undecided[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1)
-    refuting = None if proof.refuting is None else dict(zip(box, proof.refuting.tolist(), strict=True))
+    shares = ((cover.undecided[:, :, 1] - cover.undecided[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1)
+    refuting = None if cover.refuting is None else dict(zip(box, cover.refuting.tolist(), strict=True))
     if proof.verdict == "refuted":
         reason = "every run violates the claim where " + ", ".join(
             f"{path} = {ends[0]:.6g}" if ends[0] == ends[1] else f"{path} in [{ends[0]:.6g}, {ends[1]:.6g}]"
             for path, ends in (refuting or {}).items()
         )
     elif proof.verdict == "undecided":
-        cells = "one cell" if len(proof.undecided) == 1 else f"{len(proof.undecided):,} cells"
+        cells = "one cell" if len(cover.undecided) == 1 else f"{len(cover.undecided):,} cells"
         reason = f"{100 * shares.sum():.3g} % of the box is left in {cells}"
-        reason += f" ({proof.failure})" if proof.failure else ""
-        reason += "; a greater --budget goes on" if len(proof.cells) else ""
-        reason = reason if len(proof.undecided) else proof.failure
+        reason += f" ({cover.failure})" if cover.failure else ""
+        reason += "; a greater --budget goes on" if len(cover.cells) else ""
+        reason = reason if len(cover.undecided) else cover.failure
     else:
         reason = ""
     values = {
         "verdict": proof.verdict,
         "reason": reason,
         "over": {path: list(ends) for path, ends in box.items()},
-        "claims": [claim._asdict() for claim in claims],
+        "claims": [claim._asdict() for claim in proof.claims],
         "bounds": bounds,
         "refuted_by": refuting,
-        "cells": len(proof.cells),
-        "left": len(proof.undecided),
+        "cells": len(cover.cells),
+        "left": len(cover.undecided),
         "share_left": float(shares.sum()),
-        "tried": proof.tried,
-        "seconds": proof.seconds,
+        "tried": cover.tried,
+        "seconds": cover.seconds,
     }
     return console.document("prove", scenario, values, "numpy")

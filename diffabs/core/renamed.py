@@ -20,7 +20,7 @@ RENAMED = {
     "lqg": {"voltage_max": "predicted_high"},
     "polytope": {"most": "max_points"},
     "gaussian": {"known": "distributions"},
-    "prove_box": {"known": "extremes"},
+    "cover_box": {"known": "extremes"},
     "verify_box": {"known": "extremes"},
     "ExtremumSeeking": {
         **{"least_slip": "slip_low", "greatest_slip": "slip_high", "least_deceleration": "deceleration_floor"}

@@ -1,6 +1,7 @@
 """Scenarios: TOML files to loops and tasks, and back.
 
-Exports `load`, `loads`, `dump`, `names`, `Scenario` and `ScenarioError`.
+Exports `load`, `loads`, `dump`, `names`, `Scenario`, `ScenarioError`, and proofs from the loop to the file and back:
+`prove_box`, `verify`, `Proof` and `Verification`.
 """
 
 from typing import TYPE_CHECKING
@@ -8,6 +9,10 @@ from typing import TYPE_CHECKING
 from diffabs.host.exports import lazy_getattr
 
 if TYPE_CHECKING:
+    from diffabs.scenario.proofs import Proof as Proof
+    from diffabs.scenario.proofs import Verification as Verification
+    from diffabs.scenario.proofs import prove_box as prove_box
+    from diffabs.scenario.proofs import verify as verify
     from diffabs.scenario.scenario import Scenario as Scenario
     from diffabs.scenario.scenario import ScenarioError as ScenarioError
     from diffabs.scenario.scenario import dump as dump

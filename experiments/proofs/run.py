@@ -24,7 +24,7 @@ import numpy as np
 import diffabs as d
 from diffabs.parts.objectives import SettlingTime
 from diffabs.parts.sensors import Quantisation, SpeedScale
-from diffabs.robust.reach import RunClaim, prove_box
+from diffabs.robust.reach import RunClaim, cover_box
 from diffabs.robust.reach.engine import Prover
 from diffabs.scenario.scenario import load
 
@@ -57,7 +57,7 @@ def is_proved(
     """Return whether the overshoot of every run is proved to be at most a bound; `more`: further sides of the box."""
     claim = RunClaim("greatest slip", (1 + overshoot) * config.slip)
     box = {"plant.mass": config.mass, **(more or {})}
-    return prove_box(loop, box, [claim], signals=("slip",), horizon=3.0, budget=config.budget).verdict == "proved"
+    return cover_box(loop, box, [claim], signals=("slip",), horizon=3.0, budget=config.budget).verdict == "proved"
 
 
 def greatest_that_holds(config: Config, low: float, high: float, holds: Callable[[float], bool]) -> float:
@@ -114,7 +114,7 @@ def tube(config: Config) -> tuple[Any, Any]:
     """Return the proved tube of the slip on a grid of times, shape (times, 3), and the slips of runs at these times."""
     low, high = config.limits
     loop = load("slip-lmi", [f"controller.low={low}", f"controller.high={high}"]).loop
-    proof = prove_box(loop, {"plant.mass": config.mass}, signals=("slip",), horizon=3.0, budget=config.budget)
+    proof = cover_box(loop, {"plant.mass": config.mass}, signals=("slip",), horizon=3.0, budget=config.budget)
     if proof.verdict != "proved":
         raise SystemExit("the tube is not proved within the budget")
     grid = np.arange(0.0, config.shown, 1e-3)

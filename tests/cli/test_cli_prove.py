@@ -18,7 +18,9 @@ from scipy.linalg import expm
 from diffabs.cli.prove import _document
 from diffabs.cli.show import show_verification
 from diffabs.cli.show_proofs import show_box_proof
+from diffabs.robust.reach.extremes import ExtremeRuns
 from diffabs.scenario.outside import lend_modules
+from diffabs.scenario.proofs import Proof
 from diffabs.scenario.scenario import load
 
 pytestmark = pytest.mark.usefixtures("native_prover")
@@ -173,12 +175,15 @@ def test_a_single_value_zero_is_not_widened() -> None:
 @killed_by("cli.prove", "if worst and math.isfinite(high)", "if math.isfinite(high)")
 def test_a_bound_around_zero_has_no_relative_looseness() -> None:
     empty = np.zeros((0, 1, 2))
-    proof: Any = SimpleNamespace(
+    cover: Any = SimpleNamespace(
         **{"bounds": {"greatest slip": (0.0, 0.01)}, "undecided": empty, "cells": empty, "refuting": None},
-        **{"verdict": "proved", "tried": 1, "seconds": 0.0},
+        **{"verdict": "proved", "tried": 1, "seconds": 0.0, "failure": ""},
     )
     chosen, box = load("slip-lmi", integrated=False), {"plant.mass": (5.0, 6.0)}
-    found = [_document(proof, chosen, box, [], {"greatest slip": (0.0, worst)}) for worst in (0.0, 0.008)]
+    found = []
+    for worst in (0.0, 0.008):
+        extremes = ExtremeRuns({"greatest slip": (0.0, worst)}, {})
+        found.append(_document(Proof(chosen.loop, chosen.solver, box, (), extremes, cover), chosen))
     assert [one["bounds"]["greatest slip"]["looseness"] for one in found] == [None, pytest.approx(0.25)]
 
 

@@ -16,7 +16,7 @@ from diffabs.scenario.scenario import load
 from diffabs.tune import identify
 
 CLASSES = {type(part).__name__: type(part) for family in FAMILIES for part in family_types(family).values()}
-FUNCTIONS = (linear.lqg, design.polytope, identify.gaussian, reach.prove_box, verify_box)
+FUNCTIONS = (linear.lqg, design.polytope, identify.gaussian, reach.cover_box, verify_box)
 OWNERS = CLASSES | {call.__name__: call for call in FUNCTIONS}
 NAMES = [(owner, old, new) for owner, names in RENAMED.items() for old, new in names.items()]
 

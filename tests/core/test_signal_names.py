@@ -14,7 +14,7 @@ import diffabs as d
 from diffabs import controllers, objectives, references, stops
 from diffabs.core.protocols import Memory
 from diffabs.core.pytree import param, pytree
-from diffabs.robust.reach import RunClaim, prove_box
+from diffabs.robust.reach import RunClaim, cover_box
 from diffabs.robust.reach.equations import derive_equations
 
 NAMES = ["t", "time", "target", "setpoint", "feedforward", "command", "control", "sample", "units", "metrics"]
@@ -92,7 +92,7 @@ def test_an_output_with_the_name_of_a_signal_is_refused(name):
         lambda: d.rollout(loop, SOLVER),
         lambda: d.run_batch(loop, d.Batch({"plant.rate": [1.0, 2.0]}), SOLVER, {}),
         lambda: derive_equations(loop, ["plant.rate"]),
-        lambda: prove_box(loop, {"plant.rate": (1.0, 2.0)}, [RunClaim(f"greatest {name}", 2.0)], horizon=0.5),
+        lambda: cover_box(loop, {"plant.rate": (1.0, 2.0)}, [RunClaim(f"greatest {name}", 2.0)], horizon=0.5),
     ):
         with pytest.raises(ValueError, match=why):
             use()

@@ -96,7 +96,7 @@ MOST_USED = {
     *("core.pytree.replace", "engine.run.rollout", "engine.run.measure", "loop.ensemble.run_batch"),
     *("engine.solve.solve", "engine.types.FixedStep", "engine.types.Adaptive", "parts.controllers.pid.PID"),
     *("linear.regulator.lqr", "linear.riccati.care", "linear.stability_margins.margins"),
-    *("robust.design.synthesis.design", "robust.design.analysis.certify", "robust.reach.cover.prove_box"),
+    *("robust.design.synthesis.design", "robust.design.analysis.certify", "scenario.proofs.prove_box"),
     *("tune.tuning.tune", "tune.tuning.build_problem", "tune.worst.worst_case"),
     *(
         "tune.identify.identification.identify",
@@ -146,7 +146,8 @@ DEAR = (  # some seconds of compiling
     *(
         "diffabs.uncertainty.sweep.run.sweep",
         "diffabs.tune.identify.identification.identify",
-        "diffabs.robust.reach.cover.prove_box",
+        "diffabs.robust.reach.cover.cover_box",
+        "diffabs.scenario.proofs.prove_box",
     ),
     *("diffabs.engine.solve.solve", "diffabs.engine.run.rollout"),
 )

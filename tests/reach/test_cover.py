@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 import diffabs as d
 from diffabs.parts.objectives import Overshoot, StopDistance, StopTime
-from diffabs.robust.reach import NoRule, RunClaim, prove_box
+from diffabs.robust.reach import NoRule, RunClaim, cover_box
 from diffabs.robust.reach.cover import _cut_to_size, comes_from_halving
 from diffabs.robust.reach.engine import FAILURES, Prover
 from diffabs.robust.reach.equations import Equations, RealOperation, derive_equations
@@ -116,7 +116,7 @@ def rig_run(mass: float, speed: float, high: float = 9.03) -> tuple[float, float
 
 @pytest.mark.slow
 def test_published_gain_within_its_limits() -> None:
-    proof = prove_box(
+    proof = cover_box(
         load("slip-lmi", LIMITED).loop,
         SMALL,
         [RunClaim("greatest slip", 0.34)],
@@ -171,9 +171,9 @@ def test_false_claims_are_refuted(quantity: str) -> None:
     worst = int(np.argmax(values))
     claim = RunClaim(quantity, values[worst] * 0.999)
     loop = load("slip-lmi", LIMITED).loop
-    assert prove_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=1).verdict != "proved"
+    assert cover_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=1).verdict != "proved"
     assert (
-        prove_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=20, suspects=[corners[worst]]).verdict
+        cover_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=20, suspects=[corners[worst]]).verdict
         == "refuted"
     )
 
@@ -192,12 +192,12 @@ def test_no_false_claim_of_a_hundred_is_proved() -> None:
         column = int(rng.integers(3))
         bound = rig_run(mass, speed)[column] * 0.999
         claim = RunClaim(("greatest slip", "stop_time", "stop_distance")[column], bound)
-        assert prove_box(loop, box, [claim], signals=("slip",), horizon=2.0, budget=prove_time).verdict != "proved"
+        assert cover_box(loop, box, [claim], signals=("slip",), horizon=2.0, budget=prove_time).verdict != "proved"
 
 
 @pytest.mark.slow
 def test_without_time_nothing_is_decided() -> None:
-    proof = prove_box(
+    proof = cover_box(
         load("slip-lmi", LIMITED).loop, SMALL, [RunClaim("greatest slip", 0.34)], horizon=2.0, budget=1e-9
     )
     assert proof.verdict == "undecided"
@@ -209,7 +209,7 @@ def test_without_time_nothing_is_decided() -> None:
 def test_a_claim_about_no_quantity_is_refused(quantity: str) -> None:
     message = f"claims: '{quantity}' is no quantity of this loop; there is stop_time, stop_distance, and .* slip, speed"
     with pytest.raises(ValueError, match=message):
-        prove_box(load("slip-lmi", LIMITED).loop, SMALL, [RunClaim(quantity, 0.34)], horizon=2.0)
+        cover_box(load("slip-lmi", LIMITED).loop, SMALL, [RunClaim(quantity, 0.34)], horizon=2.0)
 
 
 @killed_by("robust.reach.cover", "if not 0 < value < math.inf:", "if False:", case="a horizon before the start")
@@ -238,7 +238,7 @@ def test_a_claim_about_no_quantity_is_refused(quantity: str) -> None:
 def test_a_wrong_argument_of_a_proof_is_named(wrong: dict[str, Any], message: str) -> None:
     given: dict[str, Any] = {"over": {"plant.mass": (5.3, 5.3)}, "horizon": 2.0, "budget": 1.0, **wrong}
     with pytest.raises(ValueError, match=message):
-        prove_box(load("slip-lmi", LIMITED).loop, **given)
+        cover_box(load("slip-lmi", LIMITED).loop, **given)
 
 
 def test_a_setting_that_does_not_exist_is_refused() -> None:
@@ -252,7 +252,7 @@ def test_a_side_of_two_floats_is_not_halved() -> None:
     """A run that stops too late keeps the proof refining; there is no float between two neighbours."""
     box = {"plant.mass": (float(np.nextafter(5.5, 0.0)), float(np.nextafter(5.5, 6.0)))}
     fast = load("slip-lmi", [*LIMITED, "initial.speed_kmh=7"]).loop
-    proof = prove_box(fast, box, horizon=1.0, budget=60.0, extremes={"stop_time": (0.001, 0.002)})  # it ends at once
+    proof = cover_box(fast, box, horizon=1.0, budget=60.0, extremes={"stop_time": (0.001, 0.002)})  # it ends at once
     assert proof.cells.tolist() == [[list(*box.values())]]
 
 
@@ -282,7 +282,7 @@ def test_many_halvings_of_many_sides_are_found() -> None:
 @killed_by("robust.reach.cover", "again = now[~satisfied]\n", "again = now[~satisfied][1:]\n")
 def test_cells_cover_the_box() -> None:
     worst = max(rig_run(m, v)[0] for m in SMALL["plant.mass"] for v in SMALL["initial.speed"])
-    proof = prove_box(
+    proof = cover_box(
         load("slip-lmi", LIMITED).loop,
         SMALL,
         [RunClaim("greatest slip", worst * 1.0002)],
@@ -304,7 +304,7 @@ def test_cells_cover_the_box() -> None:
 def test_random_runs_lie_within_their_cells(name: str, changes: list[str], claim: float) -> None:
     box = {"plant.mass": (5.3, 5.5), "initial.speed": (6.0, 6.5)}
     chosen = load(name, changes)
-    proof = prove_box(chosen.loop, box, [RunClaim("greatest slip", claim)], signals=("slip",), horizon=2.0, budget=200)
+    proof = cover_box(chosen.loop, box, [RunClaim("greatest slip", claim)], signals=("slip",), horizon=2.0, budget=200)
     assert proof.verdict == "proved"
     rng = np.random.default_rng(0)
     points = np.stack([rng.uniform(low, high, 10_000) for low, high in box.values()], 1)
@@ -326,7 +326,7 @@ def test_a_run_beyond_a_proved_bound_makes_the_proof_undecided(both: bool) -> No
     loop, claims = load("slip-lmi", LIMITED).loop, [RunClaim("greatest slip", 0.9)]
 
     def prove(known):
-        return prove_box(loop, {"plant.mass": (5.5, 5.5)}, claims, horizon=2.5, extremes=known)
+        return cover_box(loop, {"plant.mass": (5.5, 5.5)}, claims, horizon=2.5, extremes=known)
 
     alone = prove({})
     assert alone.verdict == "proved"

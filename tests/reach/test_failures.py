@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from diffabs.robust.reach.cover import RunClaim, prove_box
+from diffabs.robust.reach.cover import RunClaim, cover_box
 from diffabs.robust.reach.engine import FAILURES, Prover
 from diffabs.robust.reach.equations import derive_equations
 from diffabs.scenario.scenario import load
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("native_prover")
 def test_a_slip_that_becomes_negative_is_named() -> None:
     """Air decelerates the car of [pedro] before its brake does, so its wheel first runs faster than the road."""
     loop = load("literature-pedro").loop
-    proof = prove_box(loop, {"plant.mass": (435.0, 445.0)}, [RunClaim("greatest slip", 0.9)], horizon=1.0, budget=60)
+    proof = cover_box(loop, {"plant.mass": (435.0, 445.0)}, [RunClaim("greatest slip", 0.9)], horizon=1.0, budget=60)
     assert (proof.verdict, proof.tried, len(proof.cells)) == ("undecided", 0, 0)
     assert proof.failure == "even one run is not proved: the slip may become negative"
 

@@ -15,7 +15,7 @@ from seams import replace_seam
 import diffabs as d
 from diffabs.core.types import JsonObject
 from diffabs.robust.reach.certificate import FORMAT, tail_document
-from diffabs.robust.reach.cover import RunClaim, prove_box
+from diffabs.robust.reach.cover import RunClaim, cover_box
 from diffabs.robust.reach.engine import CellBounds, Prover
 from diffabs.robust.reach.equations import Equations, RealOperation
 from diffabs.robust.reach.search_tail import find_tail
@@ -145,7 +145,7 @@ def test_a_cell_that_ends_in_the_tail_bounds_its_runs(period: float | None) -> N
 def test_the_claims_hold_in_the_tail(monkeypatch: pytest.MonkeyPatch, bound: float) -> None:
     replace_seam(monkeypatch, "cells_before_tail", 0)
     replace_seam(monkeypatch, "proved_equations", lambda loop, over: brake())
-    found = prove_box(LOOP, BOX, [RunClaim("greatest slip", bound)], signals=("slip",), horizon=HORIZON, budget=60)
+    found = cover_box(LOOP, BOX, [RunClaim("greatest slip", bound)], signals=("slip",), horizon=HORIZON, budget=60)
     assert found.verdict == "proved"
     assert found.tail is not None
     assert 0.2 < found.tail.pieces[-1].later_signals["slip"][1] <= bound

@@ -114,7 +114,7 @@ def test_a_wrong_member_of_a_file_is_named(changed: JsonObject, line: str) -> No
         read_proof({**document, "bounds": {}, "horizon": 1.0, **changed})
 
 
-@killed_by("cli.prove", "if not isinstance(text, str):", "if False:")
+@killed_by("scenario.proofs", "if not isinstance(text, str):", "if False:")
 @pytest.mark.parametrize(
     ("changed", "line"),
     [
@@ -130,7 +130,7 @@ def test_a_file_without_a_scenario_is_refused_by_name(changed: JsonObject, line:
     assert line in result.stderr
 
 
-@killed_by("cli.prove", "if proved and not whole", "if not whole")
+@killed_by("scenario.proofs", "if not verdict.reason and not whole", "if not whole")
 def test_a_refuted_file_has_no_hint_to_check_more(proof: pathlib.Path, tmp_path: pathlib.Path) -> None:
     document = json.loads(proof.read_text())
     shorter_duration(document)

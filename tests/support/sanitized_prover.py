@@ -8,7 +8,7 @@ import numpy as np
 from test_native import CELLS, still
 
 from diffabs.compiler.runtime import toolchain
-from diffabs.robust.reach import RunClaim, engine, prove_box
+from diffabs.robust.reach import RunClaim, cover_box, engine
 from diffabs.robust.reach.engine import Prover, apply_operation
 from diffabs.robust.reach.equations import derive_equations
 from diffabs.scenario.scenario import load
@@ -32,7 +32,7 @@ def prove_loops() -> None:
     box = {"plant.mass": (5.3, 5.32), "initial.speed": (6.0, 6.05)}
     for name, changes in (("slip-lmi", LIMITED), ("slip-cured", [])):
         loop = load(name, changes).loop
-        prove_box(loop, box, [RunClaim("greatest slip", 0.3)], signals=("slip",), horizon=2.0, budget=20.0)
+        cover_box(loop, box, [RunClaim("greatest slip", 0.3)], signals=("slip",), horizon=2.0, budget=20.0)
         equations = derive_equations(loop, box)
         prover = Prover(equations, tuple(equations.signals), 0.02)
         prover.choose_weights(np.array([5.3, 6.05]))

@@ -84,7 +84,7 @@ class BoxProof(NamedTuple):
 
 @default_flags()
 @refuse_old_names
-def prove_box(
+def cover_box(
     loop: Loop,
     over: Mapping[str, tuple[float, float]],
     claims: Sequence[RunClaim] = (),
@@ -134,10 +134,10 @@ def prove_box(
     Examples:
         The published gain of a laboratory brake keeps the slip below 0.31 for all masses of 5.75 to 5.76 kg:
 
-        >>> from diffabs.robust.reach import RunClaim, prove_box
+        >>> from diffabs.robust.reach import RunClaim, cover_box
         >>> from diffabs.scenario import load
         >>> loop = load("slip-lmi").loop
-        >>> proof = prove_box(loop, {"plant.mass": (5.75, 5.76)}, [RunClaim("greatest slip", 0.31)], horizon=2.0)
+        >>> proof = cover_box(loop, {"plant.mass": (5.75, 5.76)}, [RunClaim("greatest slip", 0.31)], horizon=2.0)
         >>> proof.verdict, proof.bounds["greatest slip"][1] <= 0.31
         ('proved', True)
     """

@@ -1,0 +1,79 @@
+"""A proof over a box from the loop to the file and back."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+from mutants import killed_by
+
+import diffabs as d
+from diffabs.host.documents import DocumentError
+from diffabs.robust.design import Polytope, certify
+from diffabs.robust.reach import RunClaim
+from diffabs.scenario.proofs import Proof, prove_box, read_proof_document, verify
+from diffabs.scenario.scenario import load, loads
+
+pytestmark = pytest.mark.usefixtures("native_prover")
+LIMITED = ["controller.low=0", "controller.high=9.03", "solver.duration=3"]
+OVER = {"plant.mass": (5.3, 5.301), "initial.speed": (2.8, 2.8001)}
+
+
+@pytest.fixture(scope="module")
+def proof(native_prover: None) -> Proof:
+    del native_prover
+    scenario = load("slip-lmi", LIMITED)
+    return prove_box(scenario.loop, scenario.solver, OVER, [RunClaim("greatest slip", 0.999)], budget=100.0)
+
+
+@killed_by("scenario.proofs", "extremes=extremes.ranges, suspects", "suspects")
+def test_a_proof_lies_beside_the_extreme_runs(proof: Proof) -> None:
+    assert proof.verdict == "proved"
+    for name, (least, greatest) in proof.extremes.ranges.items():
+        low, high = proof.bounds[name]
+        assert low <= least <= greatest <= high
+    assert proof.bounds["greatest slip"][1] <= 0.999
+
+
+@killed_by("scenario.proofs", "loop=self.loop, solver=self.solver", "solver=self.solver")
+@killed_by("scenario.proofs", "loop=self.loop, solver=self.solver", "loop=self.loop")
+def test_a_saved_proof_has_its_loop_and_is_verified(proof: Proof, tmp_path: pathlib.Path) -> None:
+    pytest.importorskip("flint")
+    proof.save(tmp_path / "p.json")
+    document = read_proof_document(tmp_path / "p.json")
+    assert document is not None
+    scenario = loads(document["scenario"].encode(), "p", "p")
+    assert scenario.solver == proof.solver
+    np.testing.assert_array_equal(scenario.loop.controller.high, 9.03)
+    verification = verify(tmp_path / "p.json", share=1e-6)
+    assert verification.proved
+    assert verification.over == {path: pytest.approx(ends) for path, ends in OVER.items()}
+    assert "greatest slip <= 0.999" in [claim.kind for claim in verification.claims]
+
+
+@killed_by("scenario.proofs", "    except documents.DocumentError:\n        raise\n", "")
+def test_a_proof_of_a_later_release_is_named(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "p.json").write_text(json.dumps({"format": "diffabs box proof 2"}))
+    with pytest.raises(DocumentError, match="diffabs box proof 2 is newer"):
+        verify(tmp_path / "p.json")
+
+
+@killed_by("scenario.proofs", 'reason if verdicts else "the file has no claims"', "reason")
+def test_a_certificate_is_verified_by_the_same_function(tmp_path: pathlib.Path) -> None:
+    box = Polytope(A=[[[0.0, 1.0], [0.0, -1.0]]], B=[[[0.0], [1.0]]])
+    certificate = certify((1.0, -1.0), box)
+    certificate.save(tmp_path / "c.json")
+    verification = verify(tmp_path / "c.json")
+    assert (verification.proved, verification.complete, verification.scenario) == (True, True, None)
+    assert [claim.kind for claim in verification.claims] == [claim.kind for claim in certificate.claims]
+    empty = {**json.loads((tmp_path / "c.json").read_text()), "claims": []}
+    (tmp_path / "c.json").write_text(json.dumps(empty))
+    assert verify(tmp_path / "c.json").reason == "the file has no claims"
+
+
+@killed_by("scenario.proofs", "    derive_equations(loop, over)  # may refuse", "    # may refuse")
+def test_a_noisy_loop_is_refused_before_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("diffabs.scenario.proofs.find_extreme_runs", lambda *_: pytest.fail("simulated"))
+    scenario = load("slip-lmi", ["sensor=noise"])
+    with pytest.raises(ValueError, match="noisy sensor"):
+        d.prove_box(scenario.loop, scenario.solver, OVER)
