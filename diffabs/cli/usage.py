@@ -3,6 +3,7 @@ usage.
 """
 
 import functools
+import importlib.metadata
 import inspect
 import re
 import sys
@@ -19,6 +20,7 @@ from diffabs.scenario.registry import register_parts
 
 # The base class of all usage errors. It is taken from the Click that this Typer uses, which may be Typer's own copy.
 UsageError: Any = typer.BadParameter.__base__
+COMMAND_GROUP = "diffabs.commands"  # entry points of other packages; each names a function of the form of a command
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print only results, warnings and errors.")]
 Parts = Annotated[
     list[str] | None, typer.Option(metavar="MODULE", help="Also use the parts in this Python module; may be repeated.")
@@ -26,7 +28,22 @@ Parts = Annotated[
 
 
 class Group(typer.core.TyperGroup):
-    """The program. It reports a wrong argument in one line, like any other error."""
+    """The program, with the commands of other packages. It reports a wrong argument in one line, like any other error.
+
+    The entry points are read only for a help page of all commands, or for a name that is none of its own.
+    """
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the commands; those of other packages come last."""
+        names = super().list_commands(ctx)
+        return [*names, *sorted(_outside_commands().keys() - {*names})]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command by its name, or None."""
+        command = super().get_command(ctx, cmd_name)
+        if command is None and (point := _outside_commands().get(cmd_name)):
+            return _load_outside_command(point)
+        return command
 
     def main(self, *args: PyTree, standalone_mode: bool = True, **more: Any) -> Scalar:
         """Run a command; exit with its status if `standalone_mode`, else return the status.
@@ -53,6 +70,27 @@ class Group(typer.core.TyperGroup):
         if standalone_mode:
             sys.exit(status)
         return status
+
+
+@functools.cache
+def _outside_commands() -> dict[str, importlib.metadata.EntryPoint]:
+    return {point.name: point for point in importlib.metadata.entry_points(group=COMMAND_GROUP)}
+
+
+def _load_outside_command(point: importlib.metadata.EntryPoint) -> Any:
+    """Return the command of another package; one that cannot be loaded says so when it is called."""
+    try:
+        function = point.load()
+    except Exception as error:
+        line = f"{point.name} cannot be loaded: {' '.join(f'{point.value}: {error}'.split())}"
+
+        def function() -> None:
+            console.fail(line)
+
+        function.__doc__ = f"{line}."
+    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    add_command(app, function, getattr(function, "example", f"{point.name} --help"), point.name)
+    return typer.main.get_command(app)
 
 
 def add_command(app: typer.Typer, function: Callable[..., PyTree], example: str, name: str | None = None) -> None:
