@@ -14,6 +14,7 @@ from commands import run
 from marks import cases
 from mutants import killed_by
 from scipy.linalg import expm
+from seams import replace_seam
 
 from diffabs.cli.prove import _document
 from diffabs.cli.show import show_verification
@@ -23,7 +24,7 @@ from diffabs.scenario.outside import lend_modules
 from diffabs.scenario.proofs import Proof
 from diffabs.scenario.scenario import load
 
-pytestmark = pytest.mark.usefixtures("native_prover")
+pytestmark = pytest.mark.usefixtures("native_prover", "any_step_is_stable")
 EXAMPLES = pathlib.Path(__file__).parents[2] / "examples"
 EXACT_POSITION = 0.0489094684039968  # [m] after 0.1 s; `exact_position` by mpmath in 30 digits
 
@@ -93,6 +94,12 @@ def test_a_bound_of_the_overshoot_is_never_rounded_up() -> None:
         assert exact * (1 - Fraction(1, 10**14)) < Fraction(claim["bound"]) <= exact
 
 
+@pytest.fixture
+def without_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A proof without the runs of its box, whose program compiles for seconds."""
+    replace_seam(monkeypatch, "find_extreme_runs", lambda *_: ExtremeRuns({}, {}))
+
+
 LIMITED = [word for change in ("low=0", "high=9.03") for word in ("--set", f"controller.{change}")]
 
 
@@ -114,6 +121,7 @@ def test_an_overshoot_needs_one_target_for_all_runs() -> None:
         pytest.param(0.05, 0.2, "greatest slip", 0.2015, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.usefixtures("without_runs")
 def test_an_overshoot_is_that_of_the_step(first, target, quantity, bound) -> None:
     """1 % of the step from the first slip to the target, up or down."""
     changes = ("--set", f"reference.slip={target}", "--set", f"initial.slip={first}", "--budget", "1")
@@ -166,6 +174,7 @@ def test_the_table_of_a_proof_has_units_and_no_negative_zero(capsys: pytest.Capt
 
 
 @killed_by("cli.prove", "low and math.nextafter", "math.nextafter")
+@pytest.mark.usefixtures("without_runs")
 def test_a_single_value_zero_is_not_widened() -> None:
     words = ("--over", "plant.mass=5.5:5.5", "--over", "initial.slip=0:0", "--budget", "1")
     found = json.loads(run("prove", "slip-lmi", *LIMITED, *words, "--claim", "no_lock", "--json", status=1).stdout)

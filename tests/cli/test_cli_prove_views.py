@@ -13,7 +13,7 @@ from seams import replace_seam
 from diffabs.output.plot.proofs import ProofMap, draw_proof
 from diffabs.output.report import build_report, find_documents
 
-pytestmark = pytest.mark.usefixtures("native_prover")
+pytestmark = pytest.mark.usefixtures("native_prover", "any_step_is_stable")
 LIMITS = ["--set", "controller.low=0", "--set", "controller.high=9.03"]
 BOX = ["--over", "plant.mass=5.3:5.4", "--over", "initial.speed_kmh=5.2:5.3"]
 

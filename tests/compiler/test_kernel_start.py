@@ -51,7 +51,7 @@ def replace_friction(kind):
         exec(program, sys.modules[Road.__module__].__dict__, names := {})
         original.__code__ = names["friction"].__code__
 
-loop = load("slip-lmi").loop
+loop = load("slip-lmi", integrated=False).loop
 asked = loop, d.Batch({"initial.speed": np.array([8.0, 9.0])}), d.FixedStep(1e-3, 1.0), {"d": objectives.StopDistance()}
 found = {}
 for kind in kinds:

@@ -399,7 +399,7 @@ def test_the_region_of_attraction_is_that_of_fixed_steps():
 
 @killed_by("engine.step.replay", "clip_rtol(np.asarray(solver.rtol, float))", "solver.rtol")
 def test_there_is_room_for_smaller_steps():
-    loop, sampled = rig().loop, load("slip-cured").loop
+    loop, sampled = rig().loop, load("slip-cured", integrated=False).loop
     assert log_capacity(loop, d.Adaptive(1e-5, 2.5)) == BASE_LOG_CAPACITY
     assert log_capacity(loop, d.Adaptive(1e-9, 2.5)) == 10 * BASE_LOG_CAPACITY
     assert log_capacity(sampled, d.Adaptive(1e-5, 2.0, 1e-3)) == BASE_LOG_CAPACITY + 3 * 2000
@@ -438,7 +438,7 @@ def test_a_field_of_infinite_slope_at_its_start_is_solved():
 
 def test_steps_that_find_themselves_are_never_unstable():
     """The same step of a grid is refused for fixed steps, and is no step of the integration for the others."""
-    loop = load("slip-estimator").loop
+    loop = load("slip-estimator", integrated=False).loop
     with pytest.raises(ValueError, match="not stable"):
         d.check(loop, d.FixedStep(1e-2, 4.0))
     d.check(loop, d.Adaptive(1e-5, 4.0, 1e-2))
@@ -470,7 +470,9 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
     "moved = state",
 )
 def test_the_error_of_a_step_is_that_of_the_worst_state():
-    loop = prepare_parts(arrays(load("slip-lmi", ["actuator=lag", "actuator.time_constant=0.01"]).loop))
+    loop = prepare_parts(
+        arrays(load("slip-lmi", ["actuator=lag", "actuator.time_constant=0.01"], integrated=False).loop)
+    )
     state = loop.start()
     state = state.with_flow(jax.tree.map(lambda x: x + 2.0, state.flow()))
     sample = loop.signals(0.0, state).sample
@@ -494,7 +496,7 @@ def test_the_error_of_a_step_is_that_of_the_worst_state():
 @killed_by("engine.step.step_size", "(moves) / size", "(moves * 0.0 + size[0]) / size", case="arm-hanging")
 @pytest.mark.parametrize("name", ["slip-lmi", "arm-hanging"])
 def test_the_longest_stable_step_is_that_of_the_eigenvalues(name):
-    loop = prepare_parts(arrays(load(name).loop))
+    loop = prepare_parts(arrays(load(name, integrated=False).loop))
     state = loop.start()
     z, tree = jax.flatten_util.ravel_pytree(state.flow())
 

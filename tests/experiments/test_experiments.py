@@ -54,7 +54,7 @@ def test_noise_blinds_the_bare_latch_and_not_the_robust_one():
 def test_a_compliant_tyre_follows_the_rigid_one_over_its_relaxation_length():
     """With the friction of its slip it moves as the rigid rig; otherwise L m' = v (mu - m), in closed form."""
     module = experiment("measured_rig.run")
-    rig = load("lab-rig-measured").loop.plant
+    rig = load("lab-rig-measured", integrated=False).loop.plant
     yielding = replace(module.as_compliant(rig), {"relaxation": 0.12})
     rigid = module.LabRigState(wheel=120.0, drum=150.0, brake=6.0, distance=1.0)
     mu, normal, torque = rig.contact(rigid)
@@ -325,7 +325,7 @@ def rows_of_page(page, first, last):
 
 def test_each_row_of_machines_has_the_bound_of_its_own_machine(monkeypatch):
     """By the left eigenvector w of the unstable pole s: |w'B| U/(s |w'd|). The page has three digits of a machine."""
-    plant, start = load("arm-hanging").loop.plant, np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])
+    plant, start = load("arm-hanging", integrated=False).loop.plant, np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])
     machines = rows_of_page("two_wheeler", "The tuned machines:", "**The paper's motor")
     bounds = rows_of_page("two_wheeler", "## A machine for the claim", "The machines of greatest bound")
     names = {"best flywheel, 3 ohm": "flywheel, 3 ohm", "best rod, 0.3 ohm, 60 A, 1.80 kW": "rod, 0.3 ohm",

@@ -345,7 +345,7 @@ def test_an_installed_module_is_known_by_its_entry_point(tmp_path, monkeypatch):
     assert listed["plants"]["dc-motor"]["parameters"]["inertia"]["unit"] == "kg m^2"
     assert listed["objectives"]["peak-current"]["unit"] == "A"
     assert "servo-start" in listed["initial"]
-    assert load(HERE / "servo.toml").loop.plant.control_unit == "V"
+    assert load(HERE / "servo.toml", integrated=False).loop.plant.control_unit == "V"
     (tmp_path / "dc_servo_installed.py").write_text("1 / 0")
     sys.modules.pop("dc_servo_installed")
     outside.installed_modules.cache_clear()
@@ -468,7 +468,7 @@ def test_a_plant_whose_usual_state_is_a_tuple_is_written_and_read(resting, tmp_p
     run("show", *AT_REST, *resting, "--out", tmp_path / "mine.toml")
     outside.register_modules(["dc_servo", "resting"])
     read = load(tmp_path / "mine.toml")
-    assert repr(read.loop) == repr(load("servo.toml", ["plant=resting", "tune.over={}"]).loop)
+    assert repr(read.loop) == repr(load("servo.toml", ["plant=resting", "tune.over={}"], integrated=False).loop)
     assert dump(read) == (tmp_path / "mine.toml").read_text()
 
 

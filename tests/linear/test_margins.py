@@ -550,7 +550,7 @@ def test_noise_is_a_disturbance_and_limits_do_not_act():
     noisy = rig(sensor=Noise(slip=0.01), controller=StateFeedback(low=0.0, high=9.03))
     np.testing.assert_allclose(open_loop(noisy).transfer().response(w), plain.response(w), rtol=1e-12)
     integrating = rig(controller=PID(ki=300.0, low=0.0, high=9.03))
-    held = dataclasses.replace(integrating, feedforward=load("slip-estimator").loop.feedforward)
+    held = dataclasses.replace(integrating, feedforward=load("slip-estimator", integrated=False).loop.feedforward)
     np.testing.assert_allclose(
         open_loop(held).transfer().response(w), open_loop(integrating).transfer().response(w), rtol=1e-9
     )
@@ -625,7 +625,7 @@ def test_the_command_says_margins_and_where_they_are_worst(tmp_path):
     assert len(result["systems"]) == 8
     slow = {"plant.mass": 6.2, "initial.speed": 5 / 3.6}
     assert result["worst"]["phase"]["values"] == pytest.approx(slow)
-    here = open_loop(load("slip-cured").loop)
+    here = open_loop(load("slip-cured", integrated=False).loop)
     assert result["margins"]["phase"] == pytest.approx(margins(here).phase, rel=1e-12)
     assert (tmp_path / "loop.png").stat().st_size > 10_000
     assert "mass 6.2 kg, speed 5 km/h" in command("margins", "slip-cured", "--samples", "0").stdout
@@ -633,7 +633,7 @@ def test_the_command_says_margins_and_where_they_are_worst(tmp_path):
     result = json.loads(done.stdout)
     assert result["systems"] == []
     assert result["margins"]["phase"] == pytest.approx(margins(open_loop(load(
-        "slip-cured", ["plant.mass=6.2", "initial.speed_kmh=6"]).loop)).phase, rel=1e-12)  # fmt: skip
+        "slip-cured", ["plant.mass=6.2", "initial.speed_kmh=6"], integrated=False).loop)).phase, rel=1e-12)  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def test_coasting_gives_the_bearings_of_table_4():
 def test_the_tables_of_the_manual_are_those_of_the_mask():
     """And not of the rig that braked: its brake is 2.8 times as strong, its friction with the same load about half."""
     with jax.enable_x64(True):
-        torque, friction = lab_rig.compare_tables(load("lab-rig-measured").loop.plant)
+        torque, friction = lab_rig.compare_tables(load("lab-rig-measured", integrated=False).loop.plant)
     assert torque["mask"] < 0.5
     assert torque["identified"] > 5
     assert friction["mask"] < 0.05
@@ -111,7 +111,7 @@ def brake_by_scipy(plant, command, speed, end):
 @killed_by("papers.lab_rig", "np.interp(curves.t + shift, t, wheel)", "np.interp(curves.t, t, wheel)")
 def test_step_braking_against_scipy(which, command):
     """The errors have the resolution of a step of 0.125 ms; the wheel slows down by 20 % in 10 ms."""
-    identified = load("lab-rig-measured").loop.plant
+    identified = load("lab-rig-measured", integrated=False).loop.plant
     plant = rig.MASK if which == "mask" else identified
     with jax.enable_x64(True):
         found = lab_rig.match_step(lab_rig.read_step(command), plant)
@@ -232,7 +232,7 @@ def test_a_record_that_cannot_be_read_is_one_line(row, needed, tmp_path):
 def recorded_by(name):
     """A run of the packaged scenario under the commands of experiment 1."""
     record = rig.read_record(rig.EXPERIMENTS[0])
-    loop = load(name).loop
+    loop = load(name, integrated=False).loop
     given = replace(loop, {"controller": rig.build_record_loop(record, True).controller})
     return record, *(rig.RecordedRun(loop=one, counter_lag=0.01326) for one in (loop, given))
 
@@ -327,7 +327,7 @@ def test_the_reproduction_has_every_number_that_the_page_prints(tmp_path):
     for row in summary["steps"]:  # no rig follows the step-braking curves
         assert row["fitted"]["wheel_rms_percent"] < 2.5
         assert min(row[state]["wheel_rms_percent"] for state in ("mask", "identified", "mask_friction")) > 20
-    scenario = load("lab-rig-measured").loop
+    scenario = load("lab-rig-measured", integrated=False).loop
     # The minimum is a flat valley: other flags of the compiler end elsewhere in it.
     for path, share in (("plant.wheel_inertia", 0.05), ("plant.road.w4", 0.03), ("actuator.rise", 0.2)):
         value = next(row["value"] for row in summary["parameters"] if row["name"] == f"loop.{path}")

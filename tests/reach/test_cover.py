@@ -19,7 +19,7 @@ from diffabs.robust.reach.engine import FAILURES, Prover
 from diffabs.robust.reach.equations import Equations, RealOperation, derive_equations
 from diffabs.scenario.scenario import load
 
-pytestmark = pytest.mark.usefixtures("native_prover")
+pytestmark = pytest.mark.usefixtures("native_prover", "any_step_is_stable")
 LIMITED = ["controller.low=0", "controller.high=9.03"]
 SMALL = {"plant.mass": (5.3, 5.32), "initial.speed": (6.0, 6.05)}  # kg, m/s
 
@@ -117,7 +117,7 @@ def rig_run(mass: float, speed: float, high: float = 9.03) -> tuple[float, float
 @pytest.mark.slow
 def test_published_gain_within_its_limits() -> None:
     proof = cover_box(
-        load("slip-lmi", LIMITED).loop,
+        load("slip-lmi", LIMITED, integrated=False).loop,
         SMALL,
         [RunClaim("greatest slip", 0.34)],
         signals=("slip",),
@@ -139,7 +139,7 @@ def test_published_gain_within_its_limits() -> None:
     "robust/reach/native/prove.cpp", "end.caused(end.way_G, end.speed, p)", "end.caused(end.time_G, end.speed, p)"
 )
 def test_the_sides_of_a_cell_widen_time_and_distance_as_in_runs() -> None:
-    prover = Prover(derive_equations(load("slip-lmi", LIMITED).loop, list(SMALL)), ("slip",), 2.0)
+    prover = Prover(derive_equations(load("slip-lmi", LIMITED, integrated=False).loop, list(SMALL)), ("slip",), 2.0)
     prover.choose_weights(np.array([5.3, 6.0]))
     found = prover.prove(np.array([[[5.3, 5.302], [6.0, 6.01]]]), 1)
     near, heavy, fast = (np.array(rig_run(*at)[1:]) for at in ((5.3, 6.0), (5.302, 6.0), (5.3, 6.01)))
@@ -150,7 +150,9 @@ def test_the_sides_of_a_cell_widen_time_and_distance_as_in_runs() -> None:
 @pytest.mark.slow
 @killed_by("robust/reach/native/prove.cpp", "if (q < 0) return;", "if (q < n) return;")
 def test_a_distance_that_is_a_signal_has_its_bounds() -> None:
-    prover = Prover(derive_equations(load("slip-lmi", LIMITED).loop, list(SMALL)), ("slip", "distance"), 2.0)
+    prover = Prover(
+        derive_equations(load("slip-lmi", LIMITED, integrated=False).loop, list(SMALL)), ("slip", "distance"), 2.0
+    )
     prover.choose_weights(np.array([5.3, 6.0]))
     found = prover.prove(np.array([[[5.3, 5.301], [6.0, 6.001]]]), 1)
     _, time, distance = rig_run(5.3, 6.0)
@@ -170,7 +172,7 @@ def test_false_claims_are_refuted(quantity: str) -> None:
     values = [rig_run(*corner)[column] for corner in corners]
     worst = int(np.argmax(values))
     claim = RunClaim(quantity, values[worst] * 0.999)
-    loop = load("slip-lmi", LIMITED).loop
+    loop = load("slip-lmi", LIMITED, integrated=False).loop
     assert cover_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=1).verdict != "proved"
     assert (
         cover_box(loop, SMALL, [claim], signals=("slip",), horizon=2.0, budget=20, suspects=[corners[worst]]).verdict
@@ -181,7 +183,7 @@ def test_false_claims_are_refuted(quantity: str) -> None:
 @pytest.mark.slow
 def test_no_false_claim_of_a_hundred_is_proved() -> None:
     """Each claim is 0.1 % better than one run of its box, which SciPy made."""
-    rng, loop, prove_time = np.random.default_rng(7), load("slip-lmi", LIMITED).loop, 1.0
+    rng, loop, prove_time = np.random.default_rng(7), load("slip-lmi", LIMITED, integrated=False).loop, 1.0
     for _ in range(100):
         mass, speed = rng.uniform(5.3, 6.2), rng.uniform(4.0, 9.0)
         shares = rng.uniform(0, 1, 2)
@@ -198,7 +200,11 @@ def test_no_false_claim_of_a_hundred_is_proved() -> None:
 @pytest.mark.slow
 def test_without_time_nothing_is_decided() -> None:
     proof = cover_box(
-        load("slip-lmi", LIMITED).loop, SMALL, [RunClaim("greatest slip", 0.34)], horizon=2.0, budget=1e-9
+        load("slip-lmi", LIMITED, integrated=False).loop,
+        SMALL,
+        [RunClaim("greatest slip", 0.34)],
+        horizon=2.0,
+        budget=1e-9,
     )
     assert proof.verdict == "undecided"
     assert proof.bounds["stop_time"] == (-math.inf, math.inf)
@@ -209,7 +215,7 @@ def test_without_time_nothing_is_decided() -> None:
 def test_a_claim_about_no_quantity_is_refused(quantity: str) -> None:
     message = f"claims: '{quantity}' is no quantity of this loop; there is stop_time, stop_distance, and .* slip, speed"
     with pytest.raises(ValueError, match=message):
-        cover_box(load("slip-lmi", LIMITED).loop, SMALL, [RunClaim(quantity, 0.34)], horizon=2.0)
+        cover_box(load("slip-lmi", LIMITED, integrated=False).loop, SMALL, [RunClaim(quantity, 0.34)], horizon=2.0)
 
 
 @killed_by("robust.reach.cover", "if not 0 < value < math.inf:", "if False:", case="a horizon before the start")
@@ -238,7 +244,7 @@ def test_a_claim_about_no_quantity_is_refused(quantity: str) -> None:
 def test_a_wrong_argument_of_a_proof_is_named(wrong: dict[str, Any], message: str) -> None:
     given: dict[str, Any] = {"over": {"plant.mass": (5.3, 5.3)}, "horizon": 2.0, "budget": 1.0, **wrong}
     with pytest.raises(ValueError, match=message):
-        cover_box(load("slip-lmi", LIMITED).loop, **given)
+        cover_box(load("slip-lmi", LIMITED, integrated=False).loop, **given)
 
 
 def test_a_setting_that_does_not_exist_is_refused() -> None:
@@ -251,7 +257,7 @@ def test_a_setting_that_does_not_exist_is_refused() -> None:
 def test_a_side_of_two_floats_is_not_halved() -> None:
     """A run that stops too late keeps the proof refining; there is no float between two neighbours."""
     box = {"plant.mass": (float(np.nextafter(5.5, 0.0)), float(np.nextafter(5.5, 6.0)))}
-    fast = load("slip-lmi", [*LIMITED, "initial.speed_kmh=7"]).loop
+    fast = load("slip-lmi", [*LIMITED, "initial.speed_kmh=7"], integrated=False).loop
     proof = cover_box(fast, box, horizon=1.0, budget=60.0, extremes={"stop_time": (0.001, 0.002)})  # it ends at once
     assert proof.cells.tolist() == [[list(*box.values())]]
 
@@ -283,7 +289,7 @@ def test_many_halvings_of_many_sides_are_found() -> None:
 def test_cells_cover_the_box() -> None:
     worst = max(rig_run(m, v)[0] for m in SMALL["plant.mass"] for v in SMALL["initial.speed"])
     proof = cover_box(
-        load("slip-lmi", LIMITED).loop,
+        load("slip-lmi", LIMITED, integrated=False).loop,
         SMALL,
         [RunClaim("greatest slip", worst * 1.0002)],
         signals=("slip",),
@@ -323,7 +329,7 @@ def test_random_runs_lie_within_their_cells(name: str, changes: list[str], claim
 @pytest.mark.parametrize("both", cases([False, True], True), ids=["above", "at both ends"])
 def test_a_run_beyond_a_proved_bound_makes_the_proof_undecided(both: bool) -> None:
     """Either the proof or the run is wrong; a stop after 20 s is."""
-    loop, claims = load("slip-lmi", LIMITED).loop, [RunClaim("greatest slip", 0.9)]
+    loop, claims = load("slip-lmi", LIMITED, integrated=False).loop, [RunClaim("greatest slip", 0.9)]
 
     def prove(known):
         return cover_box(loop, {"plant.mass": (5.5, 5.5)}, claims, horizon=2.5, extremes=known)
@@ -343,7 +349,7 @@ def test_parts_without_a_rule_are_refused_by_name() -> None:
     with pytest.raises(NoRule, match="events"):
         derive_equations(d.braking(controller=d.controllers.Relay()), ["plant.mass"])
     with pytest.raises(NoRule, match=r"plant\.weight is not a parameter"):
-        derive_equations(load("slip-lmi").loop, ["plant.weight"])
+        derive_equations(load("slip-lmi", integrated=False).loop, ["plant.weight"])
 
 
 def tape(*operations: tuple) -> tuple[RealOperation, ...]:

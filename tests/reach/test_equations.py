@@ -29,18 +29,18 @@ from diffabs.scenario.scenario import load
 @killed_by("robust.reach.equations", "for speed in (SLOWEST, FASTEST)", "for speed in (FASTEST,)")
 def test_a_plant_whose_slip_is_another_one_at_low_speed_is_refused() -> None:
     """The slip of the rig is (v - w)/max(v, w, crawl speed)."""
-    assert derive_equations(load("slip-lmi").loop, ["plant.mass"]).params == ("plant.mass",)
+    assert derive_equations(load("slip-lmi", integrated=False).loop, ["plant.mass"]).params == ("plant.mass",)
     for crawl in (0.02001, 3.0):
         with pytest.raises(NoRule, match=r"its slip is not 1 - w/v"):
-            derive_equations(load("slip-lmi", [f"plant.crawl_speed={crawl}"]).loop, ["plant.mass"])
+            derive_equations(load("slip-lmi", [f"plant.crawl_speed={crawl}"], integrated=False).loop, ["plant.mass"])
 
 
 @killed_by("robust.reach.equations", "check_slip_chart(self.loop, self.paths)", "check_slip_chart(self.loop)")
 def test_a_parameter_of_the_box_must_not_change_the_slip() -> None:
     radii = ["plant.wheel_radius", "plant.body_radius"]
-    assert derive_equations(load("slip-lmi").loop, radii).params == tuple(radii)
+    assert derive_equations(load("slip-lmi", integrated=False).loop, radii).params == tuple(radii)
     with pytest.raises(NoRule, match=r"its slip is not 1 - w/v"):
-        derive_equations(load("slip-lmi").loop, ["plant.crawl_speed"])
+        derive_equations(load("slip-lmi", integrated=False).loop, ["plant.crawl_speed"])
 
 
 @killed_by(
@@ -50,7 +50,7 @@ def test_a_parameter_of_the_box_must_not_change_the_slip() -> None:
 def test_a_range_of_periods_or_delays_is_refused(path: str) -> None:
     """The equations have one period, that of the scenario."""
     with pytest.raises(NoRule, match="range of periods or delays"):
-        derive_equations(load("slip-cured").loop, [path])
+        derive_equations(load("slip-cured", integrated=False).loop, [path])
 
 
 # What a program says beside its values: derivatives that a part declares, the number of a tick, tests for NaN.
@@ -131,9 +131,9 @@ def test_rates_come_from_the_values_of_the_output(plant: type[QuarterCar]) -> No
 
 NUMBERED = {
     "a played noise": load(
-        "slip-cured", ["sensor=played-wheel-noise", "sensor.period=0.001", "sensor.noise=[0.0,0.1]"]
+        "slip-cured", ["sensor=played-wheel-noise", "sensor.period=0.001", "sensor.noise=[0.0,0.1]"], integrated=False
     ).loop,
-    "an encoder": load("slip-cured", ["sensor=encoder-slip", "sensor.period=0.001"]).loop,
+    "an encoder": load("slip-cured", ["sensor=encoder-slip", "sensor.period=0.001"], integrated=False).loop,
     "a played command": d.braking(controller=d.controllers.PlayedCommand(period=0.01, commands=np.zeros(3))),
 }
 
@@ -323,7 +323,7 @@ class ChainTorque(d.controllers.ConstantTorque):
 
 
 def test_a_controller_may_have_a_long_chain_of_operations() -> None:
-    loop = dataclasses.replace(load("slip-lmi").loop, controller=ChainTorque())
+    loop = dataclasses.replace(load("slip-lmi", integrated=False).loop, controller=ChainTorque())
     assert len(derive_equations(loop, ["plant.mass"]).operations) > 800
 
 

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("native_prover")
 
 def test_a_slip_that_becomes_negative_is_named() -> None:
     """Air decelerates the car of [pedro] before its brake does, so its wheel first runs faster than the road."""
-    loop = load("literature-pedro").loop
+    loop = load("literature-pedro", integrated=False).loop
     proof = cover_box(loop, {"plant.mass": (435.0, 445.0)}, [RunClaim("greatest slip", 0.9)], horizon=1.0, budget=60)
     assert (proof.verdict, proof.tried, len(proof.cells)) == ("undecided", 0, 0)
     assert proof.failure == "even one run is not proved: the slip may become negative"
@@ -22,7 +22,11 @@ def test_a_slip_that_becomes_negative_is_named() -> None:
 @pytest.mark.slow
 def test_a_cell_that_is_too_wide_is_named() -> None:
     limits = ["controller.low=0", "controller.high=9.03"]
-    prover = Prover(derive_equations(load("slip-lmi", limits).loop, ["plant.mass", "initial.speed"]), ("slip",), 2.0)
+    prover = Prover(
+        derive_equations(load("slip-lmi", limits, integrated=False).loop, ["plant.mass", "initial.speed"]),
+        ("slip",),
+        2.0,
+    )
     prover.choose_weights(np.array([5.3, 13.5]))
     wide, single = (
         prover.prove(np.array([cell]), 1) for cell in ([[5.3, 5.4], [13.0, 13.5]], [[5.3, 5.3], [6.0, 6.0]])

@@ -22,7 +22,7 @@ from diffabs.robust.reach.search_tail import find_tail
 from diffabs.robust.reach.tail import RunTail, stop_speed
 from diffabs.robust.reach.verification import FileVerdict, verify_box
 
-pytestmark = pytest.mark.usefixtures("native_prover")
+pytestmark = pytest.mark.usefixtures("native_prover", "any_step_is_stable")
 RATE, TARGET, HORIZON = 40.0, 0.2, 5.0
 BOX = {"b": (2.0, 3.0), "initial.speed": (4.0, 6.0)}
 LOOP = d.braking()  # stands for the loop of the scenario; `brake` takes its place

@@ -25,7 +25,7 @@ from diffabs.robust.reach.verification import (
 from diffabs.scenario.scenario import loads
 
 pytest.importorskip("flint")
-pytestmark = pytest.mark.usefixtures("native_prover")
+pytestmark = pytest.mark.usefixtures("native_prover", "any_step_is_stable")
 BOX = ["--over", "plant.mass=5.3:5.302", "--over", "initial.speed_kmh=10:10.004", "--claim", "no_lock"]
 LIMITS = ["--set", "controller.low=0", "--set", "controller.high=9.03"]
 

@@ -53,6 +53,7 @@ SEAMS = {
     "checker_remainder": "diffabs.robust.reach.checker._remainder",
     "checker_chord": "diffabs.robust.reach.checker._relax",
     "draw_proof": "diffabs.output.plot.proofs.draw_proof",
+    "find_extreme_runs": "diffabs.robust.reach.extremes.find_extreme_runs",
     "proved_equations": "diffabs.robust.reach.cover.derive_equations",
     "cells_before_tail": "diffabs.robust.reach.cover.MANY",
     "verified_equations": "diffabs.robust.reach.verification.derive_equations",
