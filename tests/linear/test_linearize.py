@@ -428,10 +428,9 @@ def one_period(loop, z, period):
 @pytest.mark.parametrize(
     "controller",
     [
-        StateFeedback(gain=np.array([-400.0, -30.0])),
-        PID(kp=30.0, ki=400.0, kd=0.3, low=-np.inf, high=np.inf),
+        pytest.param(StateFeedback(gain=np.array([-400.0, -30.0])), id="state feedback", marks=pytest.mark.slow),
+        pytest.param(PID(kp=30.0, ki=400.0, kd=0.3, low=-np.inf, high=np.inf), id="pid"),
     ],
-    ids=["state feedback", "pid"],
 )
 def test_sampled_loop_is_the_model(controller, delay):
     """The Jacobian of a period of the real sampled loop, eq. (14) at a frozen speed behind a lag, is A + B K."""
