@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from diffabs.robust.design.loop_task import ProofTask
 
 
-def build_proof_task(scenario: Scenario, gain: str | None = None, *, weighed: bool = False) -> "ProofTask":
+def read_proof_task(scenario: Scenario, gain: str | None = None, *, weighed: bool = False) -> "ProofTask":
     """Return the linear systems of a scenario with the gain `k1,k2,...` to certify; default: that of the controller."""
     read = None if gain is None else functools.partial(_read_gain, gain)
     return proving.build_proof_task(scenario, read, weighed=weighed)

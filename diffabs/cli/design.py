@@ -91,7 +91,7 @@ def certify(
             console.conclude(f"{setup.name}: {reason}")
 
 
-def verify_file(
+def verify_certificate(
     file: Annotated[
         pathlib.Path, typer.Argument(metavar="FILE.json", help="Certificate written by design, certify or prove.")
     ],
@@ -155,7 +155,7 @@ def _prepare(
 ) -> tuple[Scenario, "ProofTask"]:
     setup = console.load_scenario(scenario, changes, integrated=False)
     return setup, console.run_with_progress(
-        lambda: certificates.build_proof_task(setup, gain, weighed=weighed), "computing the polytope"
+        lambda: certificates.read_proof_task(setup, gain, weighed=weighed), "computing the polytope"
     )
 
 

@@ -18,7 +18,7 @@ from diffabs.host import files
 
 VERSION = 1  # of the documents that this release writes; it reads this version, earlier ones, and documents without any
 MAX_DOCUMENT_BYTES = 2**27  # bytes of a document that is read
-FORMAT = re.compile(r"diffabs ([a-z -]+) ([0-9]{1,9})")
+FORMAT_PATTERN = re.compile(r"diffabs ([a-z -]+) ([0-9]{1,9})")
 
 
 class DocumentError(ValueError):
@@ -42,7 +42,7 @@ def kind_of(content: Any) -> str:
         DocumentError: The document is of a later version than this release reads.
     """
     stated = content.get("format") if isinstance(content, dict) else None
-    match = FORMAT.fullmatch(stated) if isinstance(stated, str) else None
+    match = FORMAT_PATTERN.fullmatch(stated) if isinstance(stated, str) else None
     if match is None:
         return ""
     if int(match[2]) > VERSION:

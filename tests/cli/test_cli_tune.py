@@ -395,7 +395,7 @@ def test_what_the_packaged_cure_says_is_met_is_met(tmp_path, changes):
         assert row["after"] <= row["bound"] if row["name"] == "overshoot" else row["after"] >= row["bound"]
         assert row["missed"] == 0.0
     after = load(tmp_path / "c.toml")
-    asked = certificates.build_proof_task(after)
+    asked = certificates.read_proof_task(after)
     z = np.linalg.eigvals(asked.polytope.closed_loop(asked.gain)).astype(complex)
     poles = np.log(z[np.abs(z) > 1e-9]) / asked.polytope.period  # the rest decays at once
     assert (-poles.real / np.abs(poles)).min() >= after.tune.damping

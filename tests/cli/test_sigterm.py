@@ -135,7 +135,7 @@ while not interrupt.take_interrupt():
 print("a line for a terminal that is gone", file=sys.stderr, flush=True)
 os._exit(interrupt.exit_status())
 """
-INTERRUPT = ROOT / "diffabs" / "runtime" / "interrupt.py"
+INTERRUPT = ROOT / "diffabs" / "host" / "interrupt.py"
 
 
 @killed_by("host.interrupt", "_answer_end(number, _leave)", "pass", case="SIGTERM")
