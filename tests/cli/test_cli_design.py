@@ -306,9 +306,7 @@ def test_the_greatest_fall_is_at_one_end_of_the_speeds(tmp_path, monkeypatch):
     path = tmp_path / "vehicle.toml"
     path.write_text(VEHICLE.replace("[144.0, 198.0]", "[18.0, 198.0]"))
     fall = 1.01e-3 * greatest_deceleration(5.0)
-    np.testing.assert_allclose(
-        certificates.read_proof_task(load(path)).over["fall"][1], fall / (5.0 - fall), rtol=1e-4
-    )
+    np.testing.assert_allclose(certificates.read_proof_task(load(path)).over["fall"][1], fall / (5.0 - fall), rtol=1e-4)
     continuous = VEHICLE.replace('type = "sampled"\nperiod = 1e-3\n[controller.controller]\n', "").replace(*ONE_GAIN)
     path.write_text(continuous)
     task, proof = certificates.read_proof_task(load(path)), types.SimpleNamespace(quadratically_stable=None)

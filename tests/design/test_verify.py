@@ -346,7 +346,11 @@ def test_what_takes_too_long_is_refused(given, tmp_path):
 
 
 def test_the_command_takes_as_long_as_the_library():
-    (option,) = [one.default for name, one in inspect.signature(design.verify_certificate).parameters.items() if name == "seconds"]
+    (option,) = [
+        one.default
+        for name, one in inspect.signature(design.verify_certificate).parameters.items()
+        if name == "seconds"
+    ]
     assert option == verify.MAX_SECONDS
 
 
