@@ -109,7 +109,7 @@ def prove_box(
         NoCompiler: No C++ compiler of this machine works.
 
     See also:
-        `scenario.verify`: The proof of a saved file again, by independent code.
+        `verify`: The proof of a saved file again, by independent code.
         `reach.cover_box`: The proof alone, without runs.
         `tune.worst_case`: The worst run that a search finds, a bound from the other side.
 
@@ -185,7 +185,7 @@ def verify(
         ModuleNotFoundError: python-flint is not installed, for a proof over a box.
 
     See also:
-        `scenario.prove_box`: A proof that can be saved.
+        `prove_box`: A proof that can be saved.
         `design.Certificate`: Certificates about linear models.
     """
     document = read_proof_document(path)

@@ -173,7 +173,7 @@ def worst_case(
 
     See also:
         `tune.tune`: Better parameters for such cases.
-        `scenario.prove_box`: A bound that no run of the box exceeds.
+        `prove_box`: A bound that no run of the box exceeds.
         `reliability.failure_probability`: How often a bound is exceeded.
 
     Notes:

@@ -25,7 +25,7 @@ def _beside(name: str) -> Any:
 
 
 parameters = _beside("parameters")
-PACKAGE = pathlib.Path(__file__).parent.parent / "diffabs"
+PACKAGE = pathlib.Path(__file__).parents[2] / "diffabs"
 # Where `design` of `design.certify` is.
 ROOMS = {init.parent.name: f"diffabs.{init.parts[-3]}.{init.parts[-2]}" for init in PACKAGE.glob("*/*/__init__.py")}
 

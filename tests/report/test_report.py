@@ -332,7 +332,7 @@ def test_figures_of_a_sweep_do_not_lead_out_of_its_folder(tmp_path):
 def test_a_reproduction_names_no_file_as_its_scenario(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text("[plant]\nmass = 7.0\n")
-    content = PAPER_KEYS | {"paper": "slip-lmi", "scenario": str(path)}
+    content = PAPER_KEYS | {"paper": "slip-lmi", "scenario": str(path), "digest": {}}
     (tmp_path / "x.json").write_text(json.dumps(content))
     with pytest.raises(ReportError, match=r"KeyError 'scenario .*mine\.toml'"):
         build_report(find_documents(tmp_path / "x.json"))

@@ -26,7 +26,7 @@ JUDGED_COLUMNS = {"source": "source", "quantity": "quantity", "unit": "unit", "p
 def paper_section(document: Document) -> Section:
     """Return the section of a paper's reproduction."""
     content = document.content
-    name, digest = content["paper"], content["digest"]
+    name, digest = content["paper"], content["digest"]  # a KeyError of what an earlier release wrote
     if (scenario := content.get("scenario", name)) not in names():  # a document must not name a file
         raise KeyError(f"scenario {scenario}")
     # A name with a path is skipped, so that a document cannot name files outside of its folder.

@@ -69,7 +69,7 @@ def certify(
     See also:
         `design.design`: A gain with such a certificate.
         `design.Certificate`: What is proved. `diffabs verify FILE` proves a stored one again, by independent code.
-        `scenario.prove_box`: Bounds of the nonlinear loop with its limits.
+        `prove_box`: Bounds of the nonlinear loop with its limits.
 
     Notes:
         With C = A + B K at every vertex, a matrix P > 0 proves

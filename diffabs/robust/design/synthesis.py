@@ -102,7 +102,7 @@ def design(system: Polytope | Schedule, spec: Spec) -> Design:
         `design.polytope`: The linear models of a box of parameters.
         `design.certify`: Proofs about a given gain.
         `linear.lqr`: The gain for a single model, without a proof.
-        `scenario.prove_box`: Bounds of the nonlinear loop with its limits.
+        `prove_box`: Bounds of the nonlinear loop with its limits.
 
     Notes:
         With u = K x, K = F X^-1 and V = x' X^-1 x the gain minimises trace Z over X, F and Z under
