@@ -12,21 +12,17 @@ from rich.table import Table
 from diffabs.cli import console, show, tables, targets
 from diffabs.core.pytree import ParameterSpec, replace
 from diffabs.core.types import JsonObject
-from diffabs.host import provenance
+from diffabs.host import documents, provenance
 from diffabs.host.separated import read_decimal
 from diffabs.host.values import ScenarioError, format_given, read_number_in_range
+from diffabs.linear.stability_margins import MARGIN_UNITS
 from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
     from diffabs.linear.robustness import Band, System
-    from diffabs.linear.stability_margins import Margins
 
-MARGIN_UNITS = {
-    **{"gain_up": "1", "gain_down": "1", "phase": "rad", "delay": "s", "modulus": "1", "sensitivity": "1"},
-    **{"complementary": "1", "crossover": "rad/s"},
-}
 MARGIN_NAMES = {
     **{"gain_up": "gain may rise to, times", "gain_down": "gain may fall to, times", "phase": "phase margin [deg]"},
     **{"delay": "delay margin [ms]", "modulus": "modulus margin, 1/Ms", "sensitivity": "greatest |S|, Ms"},
@@ -65,15 +61,15 @@ def margins(
         with targets.new_target_file(plot, "--plot") as picture:
             setup = console.load_scenario(scenario, changes, integrated=False)
             values, target = _read_places(setup, at or ())
-            nominal, band = _find_margins(setup, values, target, samples)
-            result = _document(setup, nominal, band, values, target)
-            show_result = partial(show.as_json, result) if as_json else partial(_show, result, setup, nominal, band)
+            nominal, over = _find_margins(setup, values, target, samples)
+            result = _document(setup, nominal, over, values, target)
+            show_result = partial(show.as_json, result) if as_json else partial(_show, result, setup, nominal, over)
             if picture:
                 with console.show_before_errors(show_result):
-                    console.run_with_progress(lambda: _draw(setup, nominal, band, picture), "drawing")
+                    console.run_with_progress(lambda: _draw(setup, nominal, over, picture), "drawing")
         result["files"] |= {"plot": str(plot)} if plot else {}
         show_result()
-        _judge(setup, nominal, band)
+        _judge(setup, nominal, over)
 
 
 def _read_places(scenario: Scenario, options: Sequence[str]) -> tuple[dict[str, float], float | None]:
@@ -97,99 +93,60 @@ def _read_places(scenario: Scenario, options: Sequence[str]) -> tuple[dict[str, 
 
 def _find_margins(
     scenario: Scenario, values: dict[str, float], target: float | None, samples: int
-) -> tuple["System", "Band | None"]:
-    """Return the loop at these values, and over the remaining ranges. Raises typer.Exit for a loop without
-    linearisation.
-    """
-    from diffabs.linear.robustness import band
+) -> tuple["System", "Band"]:
+    """Return the loop at these values, and over the other ranges. Raises typer.Exit for a loop without linear model."""
+    from diffabs.linear.robustness import Band, band
 
-    loop = replace(scenario.loop, values)
-    over = {path: ends for path, ends in scenario.design.ranges(scenario.loop).items() if path not in values}
+    loop, over = replace(scenario.loop, values), _ranges(scenario, values)
     try:
-        nominal = console.run_with_progress(
-            lambda: band(loop, {}, 0, target).systems[0], f"linearising {scenario.name}"
-        )
-        return nominal, console.run_with_progress(
-            lambda: band(loop, over, samples, target), "over the ranges"
-        ) if over else None
+        here = console.run_with_progress(lambda: band(loop, {}, 0, target), f"linearising {scenario.name}")
+        work = partial(band, loop, over, samples, target)
+        return here.systems[0], console.run_with_progress(work, "over the ranges") if over else Band((), 0)
     except ValueError as error:
         console.fail(f"{scenario.name}: {error}", console.FAILED)
 
 
-def _draw(scenario: Scenario, nominal: "System", band: "Band | None", picture: pathlib.Path) -> None:
+def _ranges(scenario: Scenario, values: dict[str, float]) -> dict[str, tuple[float, float]]:
+    """Return the ranges of [design.over] whose parameters have no fixed value."""
+    return {path: ends for path, ends in scenario.design.ranges(scenario.loop).items() if path not in values}
+
+
+def _draw(scenario: Scenario, nominal: "System", over: "Band", picture: pathlib.Path) -> None:
     from diffabs.output.plot import frequency
 
-    loops = [system.loop for system in band.systems] if band else []
+    loops = [system.loop for system in over.systems]
     title = f"{scenario.title or scenario.name}: the open loop"
     frequency.loop_shape(nominal.loop, nominal.margins, loops, title=title).savefig(picture)
 
 
-def margin_numbers(loop_margins: "Margins") -> dict[str, float]:
-    """Return the margins by their names in the JSON document, in the units of `MARGIN_UNITS`."""
-    low, high = loop_margins.gain
-    return {
-        **{"gain_up": high, "gain_down": low, "phase": loop_margins.phase, "delay": loop_margins.delay},
-        **{
-            "modulus": loop_margins.modulus,
-            "sensitivity": loop_margins.sensitivity,
-            "complementary": loop_margins.complementary,
-        },
-        "crossover": loop_margins.crossover,
-    }
-
-
 def _document(
-    scenario: Scenario,
-    nominal: "System",
-    band: "Band | None",
-    values: dict[str, float],
-    target: float | None,
+    scenario: Scenario, nominal: "System", over: "Band", values: dict[str, float], target: float | None
 ) -> JsonObject:
-    """Return the JSON document, in SI. Infinity (no limit) is a text, as in an override."""
-
-    def plain(system: "System") -> JsonObject:
-        rows = margin_numbers(system.margins).items()
-        return {"stable": system.margins.stable, **{k: "inf" if v == math.inf else float(v) for k, v in rows}}
-
-    worst = band.worst() if band else {}
-    return {
+    """Return the JSON document, in SI."""
+    content = {
         "scenario": scenario.name,
         "at": values | ({} if target is None else {"target": target}),
         "period": nominal.loop.period,
         "delay_in_the_loop": nominal.loop.delay,
         "order": len(nominal.loop.transfer().A),
-        "margins": plain(nominal),
+        "margins": nominal.margins.record(),
         "units": MARGIN_UNITS,
-        "over": {path: list(ends) for path, ends in scenario.design.ranges(scenario.loop).items() if path not in values}
-        if band
-        else {},
-        "systems": [{"values": system.values, **plain(system)} for system in band.systems] if band else [],
-        "corners": band.corners if band else 0,
-        "unstable": len(band.unstable) if band else 0,
-        "worst": {name: {"value": plain(system)[name], "values": system.values} for name, system in worst.items()},
+        "over": {path: list(ends) for path, ends in _ranges(scenario, values).items()},
+        **over.record(),
         "versions": provenance.versions(),
         "files": {},
     }
+    return documents.stamp("margins", content)
 
 
-def _show(result: JsonObject, scenario: Scenario, nominal: "System", band: "Band | None") -> None:
+def _show(result: JsonObject, scenario: Scenario, nominal: "System", over: "Band") -> None:
     """Show a table of the margins, with the worst value and its place."""
-    here = margin_numbers(nominal.margins)
-    worst = band.worst() if band else {}
-    columns = [f"worst of {len(band.systems)}", "where"] if worst and band else []
-    table = Table("margin", "here", *columns)
+    worst = over.worst()
+    table = Table("margin", "here", *([f"worst of {len(over.systems)}", "where"] if worst else []))
     for name, words in MARGIN_NAMES.items():
-        row = [_format_margin(name, here[name], nominal.margins.stable)]
-        if columns:
-            system = worst.get(name)
-            row += (
-                [
-                    _format_margin(name, margin_numbers(system.margins)[name], system.margins.stable),
-                    _format_place(system.values, scenario),
-                ]
-                if system
-                else ["", ""]
-            )
+        row = [_format_margin(name, nominal)]
+        if system := worst.get(name):
+            row += [_format_margin(name, system), _format_place(system.values, scenario)]
         table.add_row(words, *row)
     when = f"sampled every {1e3 * result['period']:g} ms" if result["period"] else "in continuous time"
     delay = f", {1e3 * result['delay_in_the_loop']:g} ms of delay" if result["delay_in_the_loop"] else ""
@@ -199,9 +156,10 @@ def _show(result: JsonObject, scenario: Scenario, nominal: "System", band: "Band
     show.show_files(result)
 
 
-def _format_margin(name: str, value: float, stable: bool) -> str:
+def _format_margin(name: str, system: "System") -> str:
+    value = system.margins.numbers()[name]
     if math.isnan(value):
-        return "undecided" if name == "delay" and stable else "none"
+        return "undecided" if name == "delay" and system.margins.stable else "none"
     return "no limit" if value == math.inf else f"{value * SHOWN_IN.get(name, 1.0):.4g}"
 
 
@@ -214,11 +172,11 @@ def _format_place(values: dict[str, float], scenario: Scenario) -> str:
     return ", ".join(words)
 
 
-def _judge(scenario: Scenario, nominal: "System", band: "Band | None") -> None:
+def _judge(scenario: Scenario, nominal: "System", over: "Band") -> None:
     """Raise typer.Exit for a loop that is unstable, here or within the ranges."""
     if not nominal.margins.stable:
         console.conclude(f"{scenario.name}: the closed loop is not stable: no margins")
-    if band and band.unstable:
-        first = _format_place(band.unstable[0].values, scenario)
-        count = f"{len(band.unstable)} of {len(band.systems)} systems"
+    if over.unstable:
+        first = _format_place(over.unstable[0].values, scenario)
+        count = f"{len(over.unstable)} of {len(over.systems)} systems"
         console.conclude(f"{scenario.name}: not stable in {count} of the ranges, as at {first}")

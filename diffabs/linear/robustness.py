@@ -11,7 +11,7 @@ import numpy as np
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace
-from diffabs.core.types import Scalar
+from diffabs.core.types import JsonObject, Scalar
 from diffabs.linear.opened_loop import OpenLoop, open_loop
 from diffabs.linear.stability_margins import Margins, margins
 
@@ -61,14 +61,24 @@ class Band(NamedTuple):
         return tuple(system for system in self.systems if not system.margins.stable)
 
     def worst(self) -> dict[str, System]:
-        """Return the system with the worst value of each margin, by its name in `BADNESS`; empty if a system is
-        unstable.
+        """Return the system with the worst value of each margin, by its name in `BADNESS`; empty without
+        systems, or if one is unstable.
 
         The names are `gain_up`, `gain_down`, `phase`, `delay`, `modulus`, `sensitivity` and `complementary`.
         """
-        if self.unstable:
+        if self.unstable or not self.systems:
             return {}
         return {name: max(self.systems, key=lambda s, bad=bad: bad(s.margins)) for name, bad in BADNESS.items()}
+
+    def record(self) -> JsonObject:
+        """Return the systems, the worst value of each margin and its place, and two counts, as JSON values."""
+        worst = self.worst().items()
+        return {
+            "systems": [{"values": system.values, **system.margins.record()} for system in self.systems],
+            "corners": self.corners,
+            "unstable": len(self.unstable),
+            "worst": {name: {"value": s.margins.record()[name], "values": s.values} for name, s in worst},
+        }
 
 
 @default_flags()

@@ -21,7 +21,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.types import Any
+from diffabs.core.types import Any, JsonObject
 from diffabs.linear.delay_steps import LEAST_DISTANCE, REACHING, DelayedLoop
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.transfer import Transfer, check_transfer
@@ -41,6 +41,17 @@ MAX_DELAY_PERIODS, MAX_DELAY_MULTIPLE = 1000, 4.0
 MAX_DELAY_STEPS = 3000
 WATCHED_DISTANCE = 10 * LEAST_DISTANCE  # distance of L from -1 below which the poles are looked at after each step
 MAX_SHIFTS = 30  # periods of delay that become states; the poles of more are counted by crossings
+
+MARGIN_UNITS = {
+    "gain_up": "1",
+    "gain_down": "1",
+    "phase": "rad",
+    "delay": "s",
+    "modulus": "1",
+    "sensitivity": "1",
+    "complementary": "1",
+    "crossover": "rad/s",
+}
 
 
 class Margins(NamedTuple):
@@ -80,6 +91,17 @@ class Margins(NamedTuple):
     def modulus(self) -> float:
         """Modulus margin 1/Ms: the smallest distance of L from -1."""
         return 1 / self.sensitivity
+
+    def numbers(self) -> dict[str, float]:
+        """Return each margin and the crossover by name, with both gain margins, in the units of `MARGIN_UNITS`."""
+        low, high = self.gain
+        values = {"gain_up": high, "gain_down": low}
+        return values | {name: getattr(self, name) for name in MARGIN_UNITS if name not in values}
+
+    def record(self) -> JsonObject:
+        """Return `stable` and the `numbers` as JSON values. Infinity, which says that there is no limit, is a text."""
+        numbers = {name: "inf" if value == math.inf else float(value) for name, value in self.numbers().items()}
+        return {"stable": self.stable, **numbers}
 
 
 class Crossovers(NamedTuple):

@@ -17,8 +17,8 @@ from scipy.optimize import brentq
 from scipy.signal import cont2discrete
 
 from diffabs.core.blocks import Series
-from diffabs.linear import OpenLoop, Transfer, band, from_control, margins, open_loop, to_control
-from diffabs.linear.stability_margins import find_crossovers, is_stable
+from diffabs.linear import Band, OpenLoop, Transfer, band, from_control, margins, open_loop, to_control
+from diffabs.linear.stability_margins import MARGIN_UNITS, find_crossovers, is_stable
 from diffabs.parts.actuators import Delay, Lag, RateLimit
 from diffabs.parts.controllers import PID, ConstantTorque, HoldingInput, Relay, Sampled, StateFeedback
 from diffabs.parts.plants import BrakeStart, LabRig, MirroredRig
@@ -712,3 +712,24 @@ def test_a_fast_sampled_integrator_has_the_margins_of_its_formula(period, k):
     w = 2 * np.arcsin(k * period / 2) / period
     assert (found.crossover, found.phase) == pytest.approx((w, (np.pi - w * period) / 2), rel=1e-7)
     assert found.delay == pytest.approx(np.ceil((np.pi - w * period) / 2 / (w * period)) * period, rel=1e-7)
+
+
+@killed_by("linear.stability_margins", '"inf" if value == math.inf else float(value)', "float(value)")
+def test_a_record_of_margins_is_plain_json_with_a_unit_for_each_number():
+    limits = margins(Transfer([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
+    record = json.loads(json.dumps(limits.record()))
+    assert record["gain_up"] == "inf"
+    assert set(record) == {"stable", *MARGIN_UNITS}
+    assert record["modulus"] * record["sensitivity"] == pytest.approx(1.0, rel=1e-15)
+
+
+@killed_by("linear.robustness", 's.margins.record()[name], "values"', 's.margins.record()["modulus"], "values"')
+def test_a_record_of_a_band_has_the_worst_of_its_systems():
+    over = band(load("slip-cured").loop, {"plant.mass": (5.3, 6.2)}, 3)
+    record = json.loads(json.dumps(over.record()))
+    rows = record["systems"]
+    assert record["corners"] == 2
+    assert len(rows) == 5
+    assert record["worst"]["delay"]["value"] == min(row["delay"] for row in rows)
+    assert record["worst"]["sensitivity"]["value"] == max(row["sensitivity"] for row in rows)
+    assert Band((), 0).record() == {"systems": [], "corners": 0, "unstable": 0, "worst": {}}
