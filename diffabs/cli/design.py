@@ -14,14 +14,13 @@ import typer
 from diffabs.cli import certificates, console, show, show_proofs, targets
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
-from diffabs.host import provenance
+from diffabs.host import documents, provenance
 from diffabs.host.process import core_count
 from diffabs.scenario import proving
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
     from diffabs.robust.design.loop_task import ProofTask
-    from diffabs.scenario.proofs import Verification
 
 CHECK = "check it with: diffabs verify"
 
@@ -130,24 +129,15 @@ def verify_certificate(
             raise
         except ValueError as error:
             console.fail(f"{file}: {' '.join(str(error).split())}")
-        show.show_verification(_verification_document(file, verification), as_json)
+        versions = provenance.versions(*(["numpy"] if verification.scenario else []))
+        result = {"file": str(file), **verification.record(), "versions": versions}
+        show.show_verification(documents.stamp("verification", result), as_json)
         if verification.reason:
             console.conclude(f"{file}: not proved: {verification.reason}")
         if verification.scenario and not as_json:
             box_words = show_proofs.describe_box(verification.over, verification.scenario, digits=9)
             where = "" if verification.complete else "in the cells proved again only: "
             console.say(f"{where}for every {box_words} of the scenario in the file, whatever its title says")
-
-
-def _verification_document(file: pathlib.Path, verification: "Verification") -> JsonObject:
-    """Return the JSON document; that of a proof over a box has the box and its scenario, too."""
-    proved, box = verification.proved, {}
-    if verification.scenario:
-        over = {path: list(ends) for path, ends in verification.over.items()}
-        box = {"complete": proved and verification.complete, "scenario": verification.text, "over": over}
-    claims = [{**verdict._asdict(), "proved": not verdict.reason} for verdict in verification.claims]
-    versions = provenance.versions(*(["numpy"] if box else []))
-    return {"file": str(file), "proved": proved, **box, "claims": claims, "versions": versions}
 
 
 def _prepare(

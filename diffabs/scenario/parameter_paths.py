@@ -15,12 +15,14 @@ This module reads paths, units and intervals. The module of each section reads t
 """
 
 import dataclasses
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import JsonObject, PyTree, Table
@@ -119,6 +121,37 @@ class ParameterEntry:
             have = f"has {len(value)} numbers; the parameter has {self.shape[0]}"
             raise ScenarioError(f"{path} = {format_given(value)} {have}")
         return tuple(read_number(item, self.spec, f"{path}.{i}") for i, item in enumerate(value))
+
+
+class BoxSide(NamedTuple):
+    """One parameter of a box.
+
+    Attributes:
+        path: Path of the parameter in the loop.
+        ends: Range (low, high) in SI.
+        label: The path with the unit in which the range was given.
+        scale: Factor from SI to that unit.
+    """
+
+    path: str
+    ends: tuple[float, float]
+    label: str
+    scale: float
+
+
+def read_box(table: Table, where: str, loop: Loop) -> list[BoxSide]:
+    """Return the sides of a box, widened by a rounding so that it holds the decimal numbers of `table`."""
+    sides = []
+    for entry in read_entries(table, where, parameters_of(loop), "not a parameter of this loop"):
+        if entry.shape:
+            raise ScenarioError(f"{entry.where} is a list; a proof varies single numbers")
+        low, high = entry.range()
+        if not (math.isfinite(low) and math.isfinite(high)):
+            raise ScenarioError(f"{entry.where} = {format_given(entry.value)}: both ends must be finite")
+        # Zero is exact, and a slip must not be less.
+        ends = (low and math.nextafter(low, -math.inf), high and math.nextafter(high, math.inf))
+        sides.append(BoxSide(entry.path, ends, f"{entry.path} [{entry.spec.unit or 1}]", entry.scale))
+    return sides
 
 
 def interval_ends(value: object, where: str) -> list[PyTree] | None:

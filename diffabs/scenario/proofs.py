@@ -9,10 +9,13 @@ linear designs.
 """
 
 import dataclasses
+import math
 import os
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.types import JsonObject
@@ -61,6 +64,66 @@ class Proof:
     def bounds(self) -> dict[str, tuple[float, float]]:
         """Proved range (low, high) of each quantity; infinite ends where nothing is proved."""
         return self.cover.bounds
+
+    @property
+    def share_left(self) -> float:
+        """Share of the box, by volume, that is not proved."""
+        widths = np.array([high - low for low, high in self.over.values()])
+        undecided = self.cover.undecided
+        return float(((undecided[:, :, 1] - undecided[:, :, 0]) / np.where(widths > 0, widths, 1)).prod(1).sum())
+
+    @property
+    def reason(self) -> str:
+        """Why the claims are not proved: the part of the box that refutes one, or is left; empty if they are proved."""
+        cover = self.cover
+        if self.verdict == "refuted" and cover.refuting is not None:
+            return "every run violates the claim where " + ", ".join(
+                f"{path} = {low:.6g}" if low == high else f"{path} in [{low:.6g}, {high:.6g}]"
+                for path, (low, high) in zip(self.over, cover.refuting, strict=True)
+            )
+        if self.verdict == "proved" or not len(cover.undecided):
+            return "" if self.verdict == "proved" else cover.failure
+        cells = "one cell" if len(cover.undecided) == 1 else f"{len(cover.undecided):,} cells"
+        failure = f" ({cover.failure})" if cover.failure else ""
+        more = "; a greater --budget goes on" if len(cover.cells) else ""
+        return f"{100 * self.share_left:.3g} % of the box is left in {cells}{failure}{more}"
+
+    def unit_of(self, quantity: str) -> str:
+        """Return the unit of a quantity of the proof, empty if the plant declares none."""
+        units = {"stop_time": "s", "stop_distance": "m", **self.loop.plant.shows.units}
+        return units.get(quantity.split()[-1], "")
+
+    def record(self) -> JsonObject:
+        """Return verdict, claims and bounds as JSON values; a bound that is not proved is None.
+
+        A bound beside extreme runs has these, and `looseness`: by how much the proved bound exceeds the worst run,
+        relative to it.
+        """
+        cover = self.cover
+        return {
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "over": {path: list(ends) for path, ends in self.over.items()},
+            "claims": [claim._asdict() for claim in self.claims],
+            "bounds": {name: self._bound_record(name, *ends) for name, ends in self.bounds.items()},
+            "refuted_by": None
+            if cover.refuting is None
+            else dict(zip(self.over, cover.refuting.tolist(), strict=True)),
+            "cells": len(cover.cells),
+            "left": len(cover.undecided),
+            "share_left": self.share_left,
+            "tried": cover.tried,
+            "seconds": cover.seconds,
+        }
+
+    def _bound_record(self, name: str, low: float, high: float) -> JsonObject:
+        proved = {end: x if math.isfinite(x) else None for end, x in (("low", low), ("high", high))}
+        record = {**proved, "unit": self.unit_of(name)}
+        if name in self.extremes.ranges:
+            least_run, worst = self.extremes.ranges[name]
+            looseness = (high - worst) / worst if worst and math.isfinite(high) else None
+            record |= {"least_run": least_run, "worst_run": worst, "looseness": looseness}
+        return record
 
     def save(self, path: str | os.PathLike[str], scenario: Scenario | None = None) -> None:
         """Write the file from which `verify` proves the bounds again, complete or not at all.
@@ -161,6 +224,15 @@ class Verification(NamedTuple):
     def proved(self) -> bool:
         """Whether nothing that was checked failed."""
         return not self.reason
+
+    def record(self) -> JsonObject:
+        """Return the findings as JSON values; those about a proof over a box have the box and its scenario, too."""
+        box = {}
+        if self.scenario:
+            over = {path: list(ends) for path, ends in self.over.items()}
+            box = {"complete": self.proved and self.complete, "scenario": self.text, "over": over}
+        claims = [{**verdict._asdict(), "proved": not verdict.reason} for verdict in self.claims]
+        return {"proved": self.proved, **box, "claims": claims}
 
 
 def verify(

@@ -44,7 +44,7 @@ def proved(native_prover: None, tmp_path_factory: pytest.TempPathFactory) -> Pro
 
 
 @pytest.mark.slow
-@killed_by("cli.prove", "sides[i].scale for i in axes", "1.0 for i in axes")
+@killed_by("output.plot.proofs", "side.scale for side in sides", "1.0 for side in sides")
 def test_a_map_has_the_units_of_the_command(proved: Proved) -> None:
     folder, shown = proved
     assert (folder / "map.png").stat().st_size > 10_000

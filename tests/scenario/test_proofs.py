@@ -2,6 +2,8 @@
 
 import json
 import pathlib
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ import diffabs as d
 from diffabs.host.documents import DocumentError
 from diffabs.robust.design import Polytope, certify
 from diffabs.robust.reach import RunClaim
+from diffabs.robust.reach.extremes import ExtremeRuns
 from diffabs.scenario.proofs import Proof, prove_box, read_proof_document, verify
 from diffabs.scenario.scenario import load, loads
 
@@ -77,3 +80,35 @@ def test_a_noisy_loop_is_refused_before_it_runs(monkeypatch: pytest.MonkeyPatch)
     scenario = load("slip-lmi", ["sensor=noise"])
     with pytest.raises(ValueError, match="noisy sensor"):
         d.prove_box(scenario.loop, scenario.solver, OVER)
+
+
+def invent_proof(**values: Any) -> Proof:
+    """Return a proof whose cover has these values, over masses of 5 to 6 kg."""
+    scenario, empty = load("slip-lmi", integrated=False), np.zeros((0, 1, 2))
+    cover: Any = SimpleNamespace(
+        **{"bounds": {}, "undecided": empty, "cells": empty, "refuting": None, "verdict": "proved"}
+        | {"tried": 1, "seconds": 0.0, "failure": ""}
+        | values
+    )
+    extremes = ExtremeRuns({"greatest slip": (0.0, values.get("worst", 0.0))}, {})
+    return Proof(scenario.loop, scenario.solver, {"plant.mass": (5.0, 6.0)}, (), extremes, cover)
+
+
+@killed_by("scenario.proofs", "if worst and math.isfinite(high)", "if math.isfinite(high)")
+@killed_by("scenario.proofs", "(high - worst) / worst", "(high - worst) / high")
+def test_a_bound_around_zero_has_no_relative_looseness() -> None:
+    bounds = {"greatest slip": (0.0, 0.01), "stop_time": (1.0, np.inf)}
+    rows = [invent_proof(bounds=bounds, worst=worst).record()["bounds"] for worst in (0.0, 0.008)]
+    assert [row["greatest slip"]["looseness"] for row in rows] == [None, pytest.approx(0.25)]
+    assert rows[0]["stop_time"] == {"low": 1.0, "high": None, "unit": "s"}
+
+
+@killed_by("scenario.proofs", "if low == high else", "if True else")
+@killed_by("scenario.proofs", 'f" ({cover.failure})" if cover.failure else ""', '""')
+def test_a_proof_says_why_it_is_none() -> None:
+    refuted = invent_proof(verdict="refuted", refuting=np.array([[5.5, 5.75]]))
+    assert refuted.record()["reason"] == "every run violates the claim where plant.mass in [5.5, 5.75]"
+    assert refuted.record()["refuted_by"] == {"plant.mass": [5.5, 5.75]}
+    left = invent_proof(verdict="undecided", undecided=np.array([[[5.0, 5.25]]]), failure="no bound")
+    assert left.reason == "25 % of the box is left in one cell (no bound)"
+    assert (invent_proof().reason, invent_proof().share_left) == ("", 0.0)

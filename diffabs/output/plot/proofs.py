@@ -1,13 +1,17 @@
 """The map of a proof: its cells, each coloured by the bound that is proved in it."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 
 from diffabs.output.plot.style import COLOURS, GREY, Axes, Figure, Patch, label_axes, sheet
+
+if TYPE_CHECKING:
+    from diffabs.scenario.parameter_paths import BoxSide
+    from diffabs.scenario.proofs import Proof
 
 LEFT_HATCH, UNBOUNDED = "////", "#DDDDDD"
 MANY_CELLS = 3000  # their lines would cover them
@@ -41,6 +45,39 @@ class ProofMap(NamedTuple):
     quantity: str
     claimed: float | None
     title: str
+
+
+def map_proof(proof: "Proof", sides: Sequence["BoxSide"], title: str) -> ProofMap:
+    """Return the map of the first claim's quantity, else of the greatest slip, over one or two `sides` of the box."""
+    paths = list(proof.over)
+    axes, scales = [paths.index(side.path) for side in sides], np.array([side.scale for side in sides])
+    claims, cover = proof.claims, proof.cover
+    quantity = claims[0].quantity if claims else "greatest slip"
+    word, _, signal = quantity.rpartition(" ")
+    bounds = np.empty(0)
+    if cover.rows is not None:
+        times = {"stop_time": cover.rows.time, "stop_distance": cover.rows.distance}
+        columns = cover.rows.lower if word == "least" else cover.rows.upper
+        bounds = columns[:, cover.prover.signals.index(signal)] if word else times[quantity][:, 1]
+    kind = "lower" if word == "least" else "upper"
+    worst, ranges = proof.extremes.worst.get(quantity), proof.extremes.ranges
+
+    def in_units(cells: np.ndarray) -> np.ndarray:
+        return cells[..., axes, :] * scales[:, None]
+
+    return ProofMap(
+        labels=[side.label for side in sides],
+        box=in_units(np.array(list(proof.over.values()))),
+        cells=in_units(cover.cells),
+        bounds=bounds,
+        undecided=in_units(cover.undecided),
+        refuting=None if cover.refuting is None else in_units(cover.refuting),
+        worst=None if worst is None else np.array(worst)[axes] * scales,
+        worst_value=ranges[quantity][1] if quantity in ranges else None,
+        quantity=f"proved {kind} bound of {signal.replace('_', ' ')} [{proof.unit_of(quantity)}]",
+        claimed=claims[0].bound if claims else None,
+        title=f"{title}\n{proof.verdict}{f': {claims[0]}' if claims else ''}",
+    )
 
 
 def draw_proof(shown: ProofMap) -> Figure:

@@ -3,6 +3,9 @@
 import math
 from collections.abc import Sequence
 
+from diffabs.core.loop import Loop
+from diffabs.host.separated import read_decimal
+from diffabs.host.values import ScenarioError, unknown_name_error
 from diffabs.robust.reach.cover import RunClaim
 from diffabs.robust.reach.equations import Equations
 
@@ -15,6 +18,29 @@ def claimable_names(signals: Sequence[str]) -> list[str]:
     """Return the names of the claims about a loop whose plant shows these `signals`."""
     names = [*(f"{word}_{signal}" for signal in signals for word in END_WORDS), *TIMES]
     return names + ([OVERSHOOT, NO_LOCK] if "slip" in signals else [])
+
+
+def read_claim(text: str, loop: Loop, equations: Equations, where: str = "claim") -> RunClaim:
+    """Return the claim of a text `NAME=BOUND`, or `no_lock`. Raises ScenarioError, which begins with `where`."""
+    name, equals, number = text.partition("=")
+    names = claimable_names(loop.plant.shows._fields)
+    if name not in names:
+        raise unknown_name_error(f"{where} {name} is not a quantity of this loop", name, names)
+    if name == NO_LOCK:
+        if equals:
+            raise ScenarioError(f"{where} no_lock has no bound: it says that the slip stays below 1")
+        return no_lock_claim()
+    try:
+        bound = read_decimal(number)
+    except ValueError:
+        bound = math.nan
+    if not math.isfinite(bound):
+        raise ScenarioError(f"{where} {text} needs a finite number: {name}=BOUND")
+    try:
+        return named_claim(name, bound, equations)
+    except ValueError as error:
+        instead = f": {where} max_slip=BOUND" if bound >= 0 else ""
+        raise ScenarioError(f"{where} {error}{instead}") from None
 
 
 def no_lock_claim() -> RunClaim:

@@ -49,6 +49,10 @@ class RunClaim(NamedTuple):
     quantity: str
     bound: float
 
+    def __str__(self) -> str:
+        """Return the claim in words, with every digit of its bound."""
+        return f"{self.quantity} {'>=' if self.quantity.startswith('least') else '<='} {self.bound!r}"
+
 
 class BoxProof(NamedTuple):
     """Bounds and verdicts proved about a box.
