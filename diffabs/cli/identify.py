@@ -8,11 +8,11 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from diffabs.cli import certificates, console, progress, show, targets
-from diffabs.core.pytree import ParameterSpec, get, parameters
+from diffabs.cli.options import read_assignments
+from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject
 from diffabs.host.values import ScenarioError, format_given, read_number_in_range, unknown_name_error
 from diffabs.scenario import section_tune, toml
@@ -23,7 +23,6 @@ from diffabs.scenario.scenario import Scenario, dump
 if TYPE_CHECKING:
     from diffabs.tune.identify.fit import Identified
 
-HIGH_CORRELATION = 0.95
 DEPENDENT = {"slip", "speed", "wheel_speed"}
 REDUNDANT = (
     "slip, speed and wheel_speed depend on each other; together they make the standard deviations too small; choose"
@@ -148,36 +147,27 @@ def _compared_columns(
 def _read_noise(options: Sequence[str], readings: Readings, units: Mapping[str, str]) -> dict[str, float]:
     """Return standard deviations by column, in SI."""
     deviations: dict[str, float] = {}
-    for text in options:
-        name, equals, number = text.partition("=")
-        name = name.strip()
-        if not equals:
-            raise ScenarioError(f"--sigma {format_given(text)} is not of the form column=number")
+    for name, number, _ in read_assignments(options, "--sigma", "column=number"):
         if name not in readings.columns:
             raise unknown_name_error(
                 f"--sigma {format_given(name)} is not a column of the data", name, readings.columns
             )
-        if name in deviations:
-            raise ScenarioError(f"--sigma {name} is given twice")
         spec = ParameterSpec(units[name], low=0.0, open_low=True)
-        deviations[name] = read_number_in_range(toml.parse_value(number.strip()), spec, f"--sigma {name}")
+        deviations[name] = read_number_in_range(toml.parse_value(number), spec, f"--sigma {name}")
     return deviations
 
 
 def _read_ranges(options: Sequence[str], scenario: Scenario) -> dict[str, section_tune.Ends | None]:
     """Return ranges by path; None for the declared range."""
     table = {}
-    for text in options:
-        path, equals, ends = text.partition("=")
-        low, colon, high = ends.partition(":")
-        if not path.strip() or (equals and not colon):
+    for path, ends, text in read_assignments(options, "--free"):
+        words = [word.strip() for word in ends.split(":", 1)]
+        if not path or ("=" in text and len(words) < 2):
             raise ScenarioError(f"--free {format_given(text)} is not of the form path or path=low:high")
-        (path,) = flatten_table({path.strip(): 0.0}, "--free")
+        (path,) = flatten_table({path: 0.0}, "--free")
         if path in table:
             raise ScenarioError(f"--free {path} is given twice")
-        table[path] = (
-            [toml.parse_value(low.strip()), toml.parse_value(high.strip())] if equals else section_tune.DECLARED_RANGE
-        )
+        table[path] = [*map(toml.parse_value, words)] if "=" in text else section_tune.DECLARED_RANGE
     ranges = section_tune.free_ranges(table, scenario.loop, "--free")
     section_tune.check_starts(scenario.loop, ranges, "--free")
     return ranges
@@ -218,72 +208,10 @@ def _result(
     noise: Mapping[str, float],
 ) -> JsonObject:
     """Return the JSON document."""
-    uncertainty = fit.uncertainty
-    values = {
-        "data": {"samples": len(readings.t), "columns": list(readings.columns), "until": float(readings.t[-1])},
-        "values": _scalar_values(scenario, ranges, fit),
-        "correlations": [
-            {
-                "between": [uncertainty.names[i], uncertainty.names[j]],
-                "correlation": float(uncertainty.correlation[i, j]),
-            }
-            for i in range(len(uncertainty.names))
-            for j in range(i)
-            if abs(uncertainty.correlation[i, j]) > HIGH_CORRELATION
-        ],
-        "notes": fit.describe_limits().splitlines(),
-        "undetermined": [
-            {"direction": direction.describe(), "spread": direction.spread, "components": direction.components}
-            for direction in uncertainty.undetermined_directions()
-        ],
-        "residuals": _residuals(readings, fit, noise, scenario.loop.plant.shows.units),
-        "chi2": fit.chi2,
-        "degrees": uncertainty.degrees,
-        "scale": uncertainty.scale,
-        "reason": fit.reason.value,
-        "evaluations": fit.evaluations,
-        "parameters": {path: np.asarray(v, float).tolist() for path, _, v in parameters(fit.part)},
-    }
+    from diffabs.tune.identify.noise import describe_residuals
+
+    units, sigma = scenario.loop.plant.shows.units, {name: noise[name] for name in readings.columns}
+    residuals = {name: {**row, "unit": units[name]} for name, row in describe_residuals(fit, sigma).items()}
+    data = {"samples": len(readings.t), "columns": list(readings.columns), "until": float(readings.t[-1])}
+    values = {"data": data, **fit.record(scenario.loop, ranges), "residuals": residuals}
     return console.document("identify", scenario, values, "optax", "scipy")
-
-
-def _scalar_values(
-    scenario: Scenario, ranges: Mapping[str, section_tune.Ends | None], fit: "Identified"
-) -> dict[str, JsonObject]:
-    """Return one row for each number: a list `controller.gain` gives `controller.gain.0` and so on."""
-    specs = {path: spec for path, spec, _ in parameters(scenario.loop)}
-    rows = {}
-    for path, ends in ranges.items():
-        low, high = ends or (specs[path].low, specs[path].high)
-        values = np.asarray(fit.values[path], float)
-        low, high, before, values = np.broadcast_arrays(low, high, np.asarray(get(scenario.loop, path), float), values)
-        for at in np.ndindex(values.shape):
-            name = ".".join([path, *map(str, at)])
-            numbers = {"before": before[at], "value": values[at], "low": low[at], "high": high[at]}
-            deviation_or_reason = fit.describe_deviation(name)
-            deviation = (
-                {"deviation": None, "why": deviation_or_reason}
-                if isinstance(deviation_or_reason, str)
-                else {"deviation": deviation_or_reason}
-            )
-            rows[name] = {k: float(x) for k, x in numbers.items()} | deviation | {"unit": specs[path].unit}
-    return rows
-
-
-def _residuals(
-    readings: Readings, fit: "Identified", noise: Mapping[str, float], units: Mapping[str, str]
-) -> dict[str, JsonObject]:
-    """Return statistics of simulated minus measured, by column."""
-    from diffabs.tune.identify.noise import root_mean_square
-
-    each = np.split(np.asarray(fit.residuals), len(readings.columns))
-    return {
-        name: {
-            "sigma": noise[name],
-            "rms": root_mean_square(values),
-            "mean": float(np.mean(values)),
-            "largest": float(np.max(np.abs(values))),
-            "unit": units[name],
-        }
-        for name, values in zip(readings.columns, each, strict=True)
-    }

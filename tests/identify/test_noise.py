@@ -1,11 +1,17 @@
 """The steps that the identification of a measured run needs."""
 
+import json
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from mutants import killed_by
 
 from diffabs.engine.types import FixedStep
-from diffabs.tune.identify.noise import match_times
+from diffabs.parts.controllers import StateFeedback
+from diffabs.tune.identify.fit import fit
+from diffabs.tune.identify.noise import describe_residuals, match_times
 
 
 def test_a_trajectory_is_as_long_as_the_data() -> None:
@@ -32,3 +38,28 @@ def test_the_last_instant_of_a_file_is_in_the_run(step: float, duration: float) 
     assert matched.steps == solver.steps == round(duration / step)
     matched, t = match_times(solver, np.array([0.0, 1.01 * duration]))
     assert t[1] > matched.duration  # is refused
+
+
+@killed_by("tune.identify.fit", "self.values[path], *(ends or", "value, *(ends or")
+@killed_by("tune.identify.fit", "> HIGH_CORRELATION", "> 1.0")
+def test_a_record_has_a_row_for_each_number_with_its_deviation() -> None:
+    controller = StateFeedback(gain=(-100.0, -20.0))
+    t = jnp.linspace(0.0, 1.0, 50)
+
+    def residuals(part: StateFeedback) -> jax.Array:
+        return part.gain[0] * t + part.gain[1] * (t + 0.01 * t**2) + 130.0 * t + 0.1 * jnp.sin(40.0 * t)
+
+    free = {"gain": ((-200.0, -200.0), (-1.0, -1.0))}
+    found = fit(controller, free, residuals)
+    record = json.loads(json.dumps(found.record(controller, free)))
+    first, second = record["values"]["gain.0"], record["values"]["gain.1"]
+    assert (first["before"], second["before"], first["low"], second["high"]) == (-100.0, -20.0, -200.0, -1.0)
+    assert [first["value"], second["value"]] == list(found.values["gain"])
+    assert first["deviation"] == found.uncertainty.deviations["gain.0"]
+    assert record["parameters"]["gain"] == [first["value"], second["value"]]
+    (pair,) = record["correlations"]
+    assert pair["between"] == ["gain.1", "gain.0"]
+    assert pair["correlation"] < -0.95
+    statistics = describe_residuals(found, {"low": 1.0, "high": 2.0})
+    assert statistics["high"]["largest"] == np.abs(found.residuals[25:]).max()
+    assert statistics["low"]["mean"] == np.mean(found.residuals[:25])

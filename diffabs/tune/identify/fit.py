@@ -12,7 +12,7 @@ Source: M. A. Branch, T. F. Coleman and Y. Li, SIAM J. Sci. Comput. 21 (1999).
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 
 from diffabs.core.bijectors import FreeSpace, HalfLine, Range, parameter_space
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.core.pytree import canonical_dtypes, parameters, replace
 from diffabs.core.reason import Reason
 from diffabs.core.summary import Summary, round_for_table
 from diffabs.core.types import AnyArray, JsonObject, Part, PyTree, Table
@@ -30,6 +30,7 @@ from diffabs.host.interactive import ProgressLine, report_to
 from diffabs.tune.identify.residuals import FitProblem, Prior, ResidualEvaluation, Residuals, as_partial, check_prior
 from diffabs.tune.identify.uncertainty import Uncertainty, uncertainty
 
+HIGH_CORRELATION = 0.95  # of two values, above which a record names them
 END_COORDINATE = 7.0  # |z| beyond which a value may be held: exp(-7) of the range, or of the start's distance
 MAX_END_DISTANCE = 0.01  # of a held value from its end, in standard deviations with the others fixed
 
@@ -131,6 +132,56 @@ class Identified:
             for direction in self.uncertainty.undetermined_directions()
         ]
         return "\n".join([*ends, *open_])
+
+    def record(self, before: Part, free: Mapping[str, Range | None]) -> JsonObject:
+        """Return the fit as JSON values.
+
+        `values` has a row for each number: a list `controller.gain` gives `controller.gain.0` and so on. A number
+        without a meaningful `deviation` has the reason as `why`. `correlations` are those above 0.95.
+
+        Args:
+            before: Part or loop before the fit.
+            free: Ranges of the free parameters, as given to the fit.
+        """
+        uncertainty = self.uncertainty
+        pairs = [(i, j) for i in range(len(uncertainty.names)) for j in range(i)]
+        return {
+            "values": dict(self._value_records(before, free)),
+            "correlations": [
+                {
+                    "between": [uncertainty.names[i], uncertainty.names[j]],
+                    "correlation": float(uncertainty.correlation[i, j]),
+                }
+                for i, j in pairs
+                if abs(uncertainty.correlation[i, j]) > HIGH_CORRELATION
+            ],
+            "notes": self.describe_limits().splitlines(),
+            "undetermined": [
+                {"direction": direction.describe(), "spread": direction.spread, "components": direction.components}
+                for direction in uncertainty.undetermined_directions()
+            ],
+            "chi2": self.chi2,
+            "degrees": uncertainty.degrees,
+            "scale": uncertainty.scale,
+            "reason": self.reason.value,
+            "evaluations": self.evaluations,
+            "parameters": {path: np.asarray(v, float).tolist() for path, _, v in parameters(self.part)},
+        }
+
+    def _value_records(self, before: Part, free: Mapping[str, Range | None]) -> Iterator[tuple[str, JsonObject]]:
+        present = {path: (spec, value) for path, spec, value in parameters(before)}
+        for path, ends in free.items():
+            spec, value = present[path]
+            rows = (value, self.values[path], *(ends or (spec.low, spec.high)))
+            columns = np.broadcast_arrays(*(np.asarray(row, float) for row in rows))
+            for at in np.ndindex(columns[0].shape):
+                name = ".".join([path, *map(str, at)])
+                numbers = zip(
+                    ("before", "value", "low", "high"), (float(column[at]) for column in columns), strict=True
+                )
+                deviation = self.describe_deviation(name)
+                why = {"deviation": None, "why": deviation} if isinstance(deviation, str) else {"deviation": deviation}
+                yield name, dict(numbers) | why | {"unit": spec.unit}
 
     def __repr__(self) -> str:
         """Return the table as text."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from diffabs.core.bijectors import Range
 from diffabs.core.loop import Loop
-from diffabs.core.types import Table
+from diffabs.core.types import JsonObject, Table
 from diffabs.engine.types import Solver
 from diffabs.tune.identify.fit import Identified
 from diffabs.tune.identify.identification import identify
@@ -90,6 +90,20 @@ def match_times(solver: Solver, t: np.ndarray) -> tuple[Solver, np.ndarray]:
     solver = dataclasses.replace(solver, duration=end, every=max(1, math.ceil(steps / MAX_INSTANTS)))
     # A file has an instant in 12 digits, and the product of the steps may be less than the duration by a rounding.
     return solver, np.where(t <= end * (1 + FILE_ROUNDING), np.minimum(t, end), t)
+
+
+def describe_residuals(fit: Identified, sigma: Mapping[str, float]) -> JsonObject:
+    """Return statistics of simulated minus measured by column, whose deviations `sigma` are in the order of the fit."""
+    residuals = np.split(np.asarray(fit.residuals), len(sigma))
+    return {
+        name: {
+            "sigma": sigma[name],
+            "rms": root_mean_square(values),
+            "mean": float(np.mean(values)),
+            "largest": float(np.max(np.abs(values))),
+        }
+        for name, values in zip(sigma, residuals, strict=True)
+    }
 
 
 def root_mean_square(values: np.ndarray) -> float:
