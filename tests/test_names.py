@@ -15,7 +15,7 @@ TREES = {path.relative_to(PACKAGE): ast.parse(path.read_text("utf-8")) for path 
 # The same verb, the same meaning: a command and the function that it calls; the methods of a paper's module; a
 # formula of a checker that imports nothing of the package.
 SHARED_FUNCTIONS = {
-    *("certify", "design", "identify", "margins", "sweep", "tune"),
+    *("certify", "design", "identify", "margins", "simulate", "sweep", "tune"),
     *("compact", "figures", "loop", "reproduce", "run", "table"),
     *("he", "is_positive_definite"),
 }

@@ -1,6 +1,5 @@
-"""Output of the commands: tables for a person, JSON and CSV for a script."""
+"""Output of the commands: tables for a person, JSON for a script."""
 
-import csv
 import math
 import pathlib
 from collections.abc import Iterator, Mapping
@@ -15,9 +14,7 @@ from diffabs.cli.console import say
 from diffabs.cli.tables import open_console, show_titled_table
 from diffabs.core.bijectors import reached_bound
 from diffabs.core.summary import format_metric, round_for_table
-from diffabs.core.types import JsonObject, Params, Part
-from diffabs.engine.convert import trajectory_columns
-from diffabs.engine.types import Run
+from diffabs.core.types import JsonObject, Params
 from diffabs.host import documents
 from diffabs.papers.digest import Digest
 from diffabs.scenario.registry import unit_of
@@ -38,15 +35,6 @@ COSTS = {
 def as_json(value: object) -> None:
     """Print one JSON document to stdout; a number without a form in JSON becomes null."""
     typer.echo(documents.format_document(value))
-
-
-def write_csv(run: Run, plant: Part, path: pathlib.Path) -> None:
-    """Write the instants up to the end of the run to a CSV file, with units in its header."""
-    columns = {f"{name} [{unit}]": values for name, (unit, values) in trajectory_columns(run, plant).items()}
-    with path.open("w", encoding="utf-8", newline="\n") as file:
-        csv.writer(file, lineterminator="\n").writerow(columns)  # a plant from outside may have a comma in a unit
-        for row in zip(*(values.tolist() for values in columns.values()), strict=True):
-            file.write(",".join(f"{value:.12g}" for value in row) + "\n")
 
 
 def show_run(result: JsonObject, scenario: Scenario) -> None:

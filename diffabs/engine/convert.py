@@ -1,5 +1,7 @@
 """Conversion of a run to a summary, a pandas.DataFrame, an xarray.Dataset or a figure."""
 
+import csv
+import pathlib
 from typing import Any
 
 import jax
@@ -86,6 +88,15 @@ def trajectory_columns(run: PyTree, plant: Plant | None = None) -> dict[str, tup
     rows = int(np.sum(run.trajectory.running)) + 1  # after the end the last sample is repeated
     columns = signal_columns(run.trajectory.sample, plant)
     return {name: (unit, np.asarray(values)[:rows]) for name, (unit, values) in columns.items()}
+
+
+def write_csv(path: pathlib.Path, run: PyTree, plant: Plant) -> None:
+    """Write the `trajectory_columns` of one run to a CSV file with twelve digits; its header has names and units."""
+    columns = {f"{name} [{unit}]": values for name, (unit, values) in trajectory_columns(run, plant).items()}
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        csv.writer(file, lineterminator="\n").writerow(columns)  # a plant from outside may have a comma in a unit
+        for row in zip(*(values.tolist() for values in columns.values()), strict=True):
+            file.write(",".join(f"{value:.12g}" for value in row) + "\n")
 
 
 def to_pandas(run: PyTree, plant: Plant | None = None) -> Any:

@@ -1,7 +1,7 @@
 """Scenarios: TOML files to loops and tasks, and back.
 
-Exports `load`, `loads`, `dump`, `names`, `Scenario`, `ScenarioError`, and proofs from the loop to the file and back:
-`prove_box`, `verify`, `Proof` and `Verification`.
+Exports `load`, `loads`, `dump`, `names`, `Scenario`, `ScenarioError`, a run by `simulate`, and proofs from the loop to
+the file and back: `prove_box`, `verify`, `Proof` and `Verification`.
 """
 
 from typing import TYPE_CHECKING
@@ -19,5 +19,7 @@ if TYPE_CHECKING:
     from diffabs.scenario.scenario import load as load
     from diffabs.scenario.scenario import loads as loads
     from diffabs.scenario.scenario import names as names
+    from diffabs.scenario.simulation import Simulation as Simulation
+    from diffabs.scenario.simulation import simulate as simulate
 
 __getattr__ = lazy_getattr(__name__)

@@ -25,12 +25,13 @@ from seams import replace_seam
 from typer.testing import CliRunner
 
 import diffabs
-from diffabs.cli import main, show
+from diffabs.cli import main
 from diffabs.core.protocols import Sample
 from diffabs.core.pytree import parameters
+from diffabs.engine.convert import write_csv
 from diffabs.engine.stability import stable_step
 from diffabs.parts.objectives import BRAKING
-from diffabs.scenario import model, registry, scenario
+from diffabs.scenario import model, registry, scenario, simulation
 
 SHORT = ("--set", "solver.duration=0.02", "--set", "solver.step=1e-3", "--set", "solver.every=1")
 
@@ -58,7 +59,7 @@ def runs():
 def whole(tmp_path_factory, runs):
     """One whole run of slip-lmi with everything written."""
     folder = tmp_path_factory.mktemp("whole")
-    simulated = main._run
+    simulated = simulation._run
     with pytest.MonkeyPatch.context() as patch:
         replace_seam(patch, "main_run", lambda *args, **more: runs.append(simulated(*args, **more)) or runs[-1])
 
@@ -77,7 +78,7 @@ def whole(tmp_path_factory, runs):
 def test_json_has_what_scripts_rely_on(whole):
     folder, document = whole
     old = {"scenario", "metrics", "stopped", "diverged", "solver", "versions", "files"}
-    assert set(document) == old | {"fault", "title", "parts", "parameters", "at_limit", "warnings"}
+    assert set(document) == old | {"format", "fault", "title", "parts", "parameters", "at_limit", "warnings"}
     assert document["scenario"] == "slip-lmi"
     assert list(document["metrics"]) == list(BRAKING)
     assert document["stopped"] is True
@@ -100,7 +101,9 @@ def test_metrics_are_the_reference_numbers(whole):
     assert metrics["locked_time"] == 0.0
 
 
-@killed_by("cli.show", 'csv.writer(file, lineterminator="\\n").writerow(columns)', 'file.write(",".join(columns))')
+@killed_by(
+    "engine.convert", 'csv.writer(file, lineterminator="\\n").writerow(columns)', 'file.write(",".join(columns))'
+)
 def test_a_unit_with_a_comma_is_one_column(tmp_path):
     unit, numbers = 'deg, of the "wheel"', np.arange(2.0)
     plant, shows = types.SimpleNamespace(control_unit="V"), collections.namedtuple("Output", ["angle"])
@@ -108,7 +111,7 @@ def test_a_unit_with_a_comma_is_one_column(tmp_path):
     sample = Sample(numbers, shows(numbers), *[numbers] * 5)
     trajectory = types.SimpleNamespace(sample=sample, running=np.array([True, False]))
     run = types.SimpleNamespace(trajectory=trajectory, stopped=True)
-    show.write_csv(run, plant, tmp_path / "a.csv")
+    write_csv(tmp_path / "a.csv", run, plant)
     with (tmp_path / "a.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
     assert header == [
@@ -492,7 +495,7 @@ def test_what_export_writes_and_prints(tmp_path):
 
 
 @pytest.mark.slow
-@killed_by("cli.main", 'AT_LIMIT = "at a limit\\n"', 'AT_LIMIT = "at a limit"')
+@killed_by("scenario.simulation", 'AT_LIMIT = "at a limit\\n"', 'AT_LIMIT = "at a limit"')
 def test_an_objective_may_have_the_name_of_the_share_at_a_limit():
     limits = ("--set", "controller.low=0", "--set", "controller.high=0.1")  # far below the demand
     found = json.loads(

@@ -9,7 +9,7 @@ from mutants import killed_by
 from seams import replace_seam
 from small_scenarios import TUNE
 
-from diffabs.cli import main, margins, tune
+from diffabs.cli import margins, simulate, tune
 from diffabs.robust.design.proof.certificate import Certificate
 from diffabs.scenario.proving import without_certificate
 from diffabs.scenario.scenario import load
@@ -53,9 +53,9 @@ def test_a_tuning_that_cannot_be_written_is_shown(small, tmp_path, monkeypatch):
     assert not (tmp_path / "tuned.toml").exists()
 
 
-@killed_by("cli.main", "with console.show_before_errors(lambda: _show(result, setup, as_json)):", "if True:")
+@killed_by("cli.simulate", "with console.show_before_errors(lambda: _show(result, setup, as_json)):", "if True:")
 def test_a_run_that_cannot_be_drawn_is_shown(file, tmp_path, monkeypatch):
-    monkeypatch.setattr(main, "_draw", fill_disk)
+    monkeypatch.setattr(simulate, "_draw", fill_disk)
     content = shown("simulate", file(TUNE), "--plot", tmp_path / "run.png")
     assert content["metrics"]["iae"] > 0
     assert content["files"] == {}

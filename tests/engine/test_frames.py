@@ -18,9 +18,8 @@ from mutants import killed_by
 
 import diffabs as d
 from diffabs import objectives
-from diffabs.cli import show
 from diffabs.core.summary import Summary, format_cell, round_for_table
-from diffabs.engine.convert import signal_columns
+from diffabs.engine.convert import signal_columns, write_csv
 from diffabs.engine.matlab import write_mat
 from diffabs.host import interactive
 from diffabs.output.plot.style import sheet
@@ -177,7 +176,7 @@ def test_every_table_and_file_has_the_same_columns(run, tmp_path):
     assert units | {"setpoint": "1", "feedforward": "N m"} == units
     assert np.all(values["feedforward"] > 2)
     data = run.xarray(plant)
-    show.write_csv(run, plant, tmp_path / "run.csv")
+    write_csv(tmp_path / "run.csv", run, plant)
     write_mat(tmp_path / "run.mat", run, plant)
     header, *rows = (tmp_path / "run.csv").read_text().splitlines()
     mat = scipy.io.loadmat(tmp_path / "run.mat", simplify_cells=True)

@@ -492,7 +492,7 @@ def test_the_command_computes_the_table(by_command, swept):
         assert tables_digest([found.table().slice(0, 64)]) == tables_digest([swept.table().slice(0, 64)])
 
 
-@killed_by("cli.main", '"seed": setup.sweep.seed', '"seed": setup.seed')
+@killed_by("cli.simulate", '"seed": setup.sweep.seed', '"seed": setup.seed')
 @pytest.mark.slow
 def test_a_sample_that_is_simulated_again_is_its_row(by_command):
     folder, document, _ = by_command
