@@ -12,7 +12,6 @@ import typer
 from diffabs.cli import console, progress, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.core.pytree import ParameterSpec
-from diffabs.core.types import JsonObject
 from diffabs.host.values import ScenarioError, read_number, unknown_name_error
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
@@ -22,8 +21,6 @@ from diffabs.scenario.toml import parse_value
 if TYPE_CHECKING:
     from diffabs.uncertainty.reliability.subset_simulation import RareEvent, SubsetProgress
     from diffabs.uncertainty.sweep import Study
-
-MAX_SHOWN_FAILURES = 5
 
 
 def rare(
@@ -45,7 +42,7 @@ def rare(
     Parameters vary as [sweep.over] says. Probabilities below 1e-7 are feasible."""
     with console.end_on_errors():
         console.need_extra("sweep")
-        from diffabs.uncertainty.reliability.failure import find_metric_objection
+        from diffabs.uncertainty.reliability.failure import describe_failures, find_metric_objection
 
         setup = console.load_scenario(scenario, console.add_option_overrides(changes, "sweep", seed=seed))
         show_samples.say_unused_seed(setup)
@@ -59,7 +56,8 @@ def rare(
         except ValueError as error:
             raise ScenarioError(str(error)) from None
         event = _estimate(study, metric, bound, samples, gradients)
-        result = _document(event, study, setup, metric, bound)
+        values = describe_failures(event, study, metric, bound)
+        result = console.document("rare", setup, values, "numpy", "scipy")
         show.as_json(result) if as_json else show_samples.show_rare_event(result, setup)
 
 
@@ -111,29 +109,3 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
         console.fail(str(error), console.FAILED)
     except ValueError as error:
         raise ScenarioError(str(error)) from None
-
-
-def _document(event: "RareEvent", study: "Study", scenario: Scenario, metric: str, bound: float) -> JsonObject:
-    """Return the JSON document; its failures are values by path in SI, the likeliest first."""
-    rows = study.space.normal(event.failing[:MAX_SHOWN_FAILURES]) if len(event.failing) else {}
-    values = {
-        "metric": metric,
-        "bound": bound,
-        "unit": unit_of(scenario.objectives[metric], scenario.loop.plant),
-        "probability": event.probability,
-        "cov": event.cov,
-        "interval": list(event.interval),
-        "note": event.note,
-        "reason": event.reason.value,
-        "levels": [level._asdict() for level in event.levels],
-        "first level alone": event.plain._asdict(),
-        "subset simulation": event.subset._asdict(),
-        "importance sampling": event.importance.estimate._asdict() if event.importance else None,
-        "failures": {path: column.tolist() for path, column in rows.items()},
-        "runs": event.evaluations,
-        "gradients": event.gradients,
-        "diverged": event.diverged,
-        "seed": study.seed,
-        "engine": dict(event.engine),
-    }
-    return console.document("rare", scenario, values, "numpy", "scipy")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from diffabs.cli import console, show, sweep, targets
+from diffabs.cli import console, show, targets
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Key
 from diffabs.engine.convert import write_csv
@@ -15,6 +15,7 @@ from diffabs.engine.types import Run
 from diffabs.host import documents, provenance
 from diffabs.host.values import ScenarioError
 from diffabs.loop.checking import check_run_accuracy, describe_check
+from diffabs.scenario.samples import load_sample
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.simulation import simulate as run_scenario
 
@@ -62,7 +63,10 @@ def simulate(
             mat_file = files.enter_context(targets.new_target_file(mat, "--mat"))
             picture = files.enter_context(targets.new_target_file(plot, "--plot"))
             if from_sweep and sample is not None:
-                setup, key = console.run_with_progress(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
+                console.need_extra("sweep")
+                setup, key = console.run_with_progress(
+                    lambda: load_sample(from_sweep, sample, "--sample"), "reading the sweep"
+                )
             else:
                 overrides = console.add_option_overrides(changes, "solver", seed=seed)
                 setup = console.load_scenario(scenario or "", overrides)

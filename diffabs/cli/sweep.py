@@ -10,22 +10,19 @@ import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
-import jax.numpy as jnp
 import typer
 
 from diffabs.cli import console, progress, report, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.core.types import JsonObject, PyTree
-from diffabs.engine.admissible import first_refusal
 from diffabs.engine.drive.engine import EngineError
 from diffabs.host import documents, files
-from diffabs.host.values import ScenarioError, unknown_name_error
+from diffabs.host.values import unknown_name_error
 from diffabs.scenario import section_sweep
-from diffabs.scenario.scenario import Scenario, dump, loads
+from diffabs.scenario.scenario import Scenario, dump
 from diffabs.uncertainty.sweep.sampling import MAX_UINT32
 
 if TYPE_CHECKING:
@@ -81,7 +78,7 @@ def sweep(
         study = _with_engine(section_sweep.build_study(setup), engine, out, resume, remote=scheduler is not None)
         numbers = _numbers(keep, study.samples)
         for number in numbers:
-            _check_runnable(study, number)
+            study.accepted_lane(number)  # raises for a refused sample
         with _explain_resume(out, resume):
             results = _run(study, setup, out, resume, lambda: _computer(on, scheduler, workers))
             show_samples.warn_of_strays(results)
@@ -105,36 +102,6 @@ def sweep(
 
 def _show(result: JsonObject, scenario: Scenario, as_json: bool) -> None:
     show.as_json(result) if as_json else show_samples.show_sweep(result, scenario)
-
-
-def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
-    """Return one sample of a sweep, from 0, as a scenario with the sample's values, and the random key of its noise."""
-    console.need_extra("sweep")
-    from diffabs.uncertainty.sweep.store import SweepError, check_owner, describe_differences, read_manifest
-
-    manifest = read_manifest(folder)
-    source = manifest["source"]
-    if "scenario" not in source:
-        raise SweepError(f"{folder} was not swept from a scenario; Study.lane({number}) is this sample")
-    scenario = loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)
-    study = section_sweep.build_study(scenario)
-    swept = {name: value for name, value in manifest["study"].items() if name != "engine"}  # XLA runs single samples
-    for line in describe_differences(swept, study.table(), "study"):
-        raise SweepError(f"{folder}: the scenario in its manifest is not what was swept: {line}")
-    if not 0 <= number < study.samples:
-        console.fail(f"--sample {number} is outside [0, {study.samples - 1}]")
-    check_owner(folder, manifest, number)
-    loop, key = _check_runnable(study, number)
-    loop = jax.tree.map(lambda x: jnp.asarray(x, study.dtype), loop)
-    return dataclasses.replace(scenario, name=f"{scenario.name}, sample {number}", title="", loop=loop), key
-
-
-def _check_runnable(study: "Study", number: int) -> tuple[PyTree, jax.Array]:
-    """Return loop and key of a sample. Raises ScenarioError for a refused sample."""
-    loop, key = study.lane(number)
-    if line := first_refusal(loop, {}, study.solver):
-        raise ScenarioError(f"sample {number} was refused: {line}")
-    return loop, key
 
 
 @contextlib.contextmanager
@@ -259,16 +226,10 @@ def _result(results: "Results", study: "Study", out: pathlib.Path, check: int) -
 
     A picture that cannot be drawn then loses no statistics.
     """
-    from diffabs.uncertainty.sweep.checking import check_accuracy
-    from diffabs.uncertainty.sweep.statistics.summary import summarise_sweep
+    from diffabs.uncertainty.sweep.statistics.summary import summarise_checked_sweep
 
-    # Half steps run beside the statistics: compiled code and NumPy release Python's global lock.
-    with ThreadPoolExecutor(1) as beside:
-        halved = beside.submit(check_accuracy, study, results, check) if check else None
-        summary = summarise_sweep(results)
-    accuracy = halved.result() if halved else None
-    values = {"out": str(out), **summary, "accuracy": accuracy, "made": console.describe_run(), "files": {}}
-    result = documents.stamp("sweep", values)
+    values = {"out": str(out), **summarise_checked_sweep(results, study, check)}
+    result = documents.stamp("sweep", {**values, "made": console.describe_run(), "files": {}})
     _write_summary(out, result)
     return result
 

@@ -1,7 +1,7 @@
 """Scenarios: TOML files to loops and tasks, and back.
 
-Exports `load`, `loads`, `dump`, `names`, `Scenario`, `ScenarioError`, a run by `simulate`, and proofs from the loop to
-the file and back: `prove_box`, `verify`, `Proof` and `Verification`.
+Exports `load`, `loads`, `dump`, `names`, `Scenario`, `ScenarioError`; a run by `simulate`, and a sample of a sweep by
+`load_sample`; proofs from the loop to the file and back: `prove_box`, `verify`, `Proof` and `Verification`.
 """
 
 from typing import TYPE_CHECKING
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from diffabs.scenario.proofs import Verification as Verification
     from diffabs.scenario.proofs import prove_box as prove_box
     from diffabs.scenario.proofs import verify as verify
+    from diffabs.scenario.samples import load_sample as load_sample
     from diffabs.scenario.scenario import Scenario as Scenario
     from diffabs.scenario.scenario import ScenarioError as ScenarioError
     from diffabs.scenario.scenario import dump as dump

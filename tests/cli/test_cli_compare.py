@@ -10,9 +10,9 @@ from commands import run
 from mutants import killed_by
 from scipy.stats import t
 
-from diffabs.cli.compare import _compare_metrics
 from diffabs.cli.show_samples import show_comparison
 from diffabs.uncertainty.sweep import Results
+from diffabs.uncertainty.sweep.statistics.comparison import _compare_metrics
 
 # one worker makes what these share
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("any_step_is_stable", "without_load")]
@@ -88,7 +88,7 @@ def test_runs_that_never_reach_an_event_are_said(capsys):
     assert "7 common samples, 1 left out that diverged or were refused" in " ".join(shown.out.split())
 
 
-@killed_by("cli.compare", "if len(before) >= FEWEST:", "if len(before) < FEWEST:")
+@killed_by("uncertainty.sweep.statistics.comparison", "if len(before) >= MIN_PAIRS:", "if len(before) < MIN_PAIRS:")
 def test_a_metric_of_few_runs_has_a_row(capsys):
     """Three of five samples reach the event in both sweeps, and every sample has the other metric."""
     stop = np.array([1.0, np.inf, 2.0, 3.0, 1.5])

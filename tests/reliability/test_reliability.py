@@ -1,6 +1,7 @@
 """Rare failures of a study: against a count where they are not rare, and against a closed form where they are."""
 
 import dataclasses
+import json
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +13,7 @@ from seams import replace_seam
 import diffabs as d
 from diffabs import controllers, objectives, plants, stops
 from diffabs.scenario.defaults import braking
-from diffabs.uncertainty.reliability.failure import _make_gradient, _run_scores, failure_probability
+from diffabs.uncertainty.reliability.failure import _make_gradient, _run_scores, describe_failures, failure_probability
 from diffabs.uncertainty.reliability.importance_sampling import design_points
 from diffabs.uncertainty.sweep import Normal, Space, Study, Triangular, Uniform
 from diffabs.uncertainty.sweep.variables import Correlation
@@ -126,6 +127,7 @@ def test_a_metric_at_its_bound_has_not_failed(bound, dtype, monkeypatch):
 )
 @killed_by("uncertainty.reliability.failure", "if level.threshold == beyond", "if level.threshold >= bound")
 @killed_by("uncertainty.reliability.failure", "progress(state_bound(level))", "progress(level)")
+@killed_by("uncertainty.reliability.failure", "event.failing[:MAX_LISTED_FAILURES]", "event.failing")
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_a_level_states_whether_its_bound_is_exceeded(dtype, monkeypatch):
     """Three tenths of the masses are at the bound or above it, and a hundredth above it: a level each."""
@@ -147,6 +149,11 @@ def test_a_level_states_whether_its_bound_is_exceeded(dtype, monkeypatch):
     assert [(one.threshold, one.share, one.strict) for one in told] == [
         (one.threshold, one.share, one.strict) for one in found.levels
     ]
+    record = json.loads(json.dumps(describe_failures(found, STUDY, "max_slip", 0.1)))
+    assert (record["metric"], record["unit"], record["probability"]) == ("max_slip", "1", found.probability)
+    assert [row["threshold"] for row in record["levels"]] == [first.threshold, 0.1]
+    assert min(record["failures"]["plant.mass"]) > 6.191  # in kg, and at most five of them
+    assert len(record["failures"]["plant.mass"]) <= 5
 
 
 @killed_by("uncertainty.reliability.failure", "np.where(accepted, score[: len(z)], -np.inf)", "score[: len(z)]")

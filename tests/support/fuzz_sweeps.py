@@ -1,8 +1,6 @@
 """Changed folders of a sweep, for `fuzz_files`: what is read of one is what was written, or one line says why not."""
 
-import contextlib
 import hashlib
-import io
 import json
 import os
 import pathlib
@@ -14,8 +12,8 @@ from commands import run
 from fuzz_files import damaged, edited, in_a_line
 from sweeping import SCENARIO, described
 
-from diffabs.cli import sweep as commands_sweep
 from diffabs.scenario import scenario
+from diffabs.scenario.samples import load_sample
 from diffabs.uncertainty.sweep import Results, SweepError, sweep
 from diffabs.uncertainty.sweep.engines import ComputedChunk
 from diffabs.uncertainty.sweep.seal import CHUNK_NAME_PATTERN
@@ -51,7 +49,7 @@ class Folders:
         self.room, self.study, self.engine = room, described(TEXT), Written(room / "out")
         found = Results(room / "out")
         self.rows, self.digest, self.summary = found.pandas(), found.digest, summarise_sweep(found)
-        self.loop = commands_sweep.sample(room / "out", SAMPLE)[0].loop
+        self.loop = load_sample(room / "out", SAMPLE)[0].loop
 
     def __call__(self, rng, room):
         folder = room / "out"
@@ -120,17 +118,10 @@ class Folders:
         return "the same numbers"
 
     def from_sweep(self, folder):
-        said = io.StringIO()
-        with contextlib.redirect_stderr(said):
-            try:
-                loop = commands_sweep.sample(folder, SAMPLE)[0].loop
-            except commands_sweep.typer.Exit:
-                loop = None
-            except scenario.ScenarioError as error:
-                return in_a_line(error)
-        if loop is None:
-            assert said.getvalue().count("\n") == 1, said.getvalue()
-            return "refused in a line"
+        try:
+            loop = load_sample(folder, SAMPLE)[0].loop
+        except scenario.ScenarioError as error:
+            return in_a_line(error)
         same = jax.tree.map(lambda a, b: bool(np.array_equal(a, b)), loop, self.loop)
         assert all(jax.tree.leaves(same)), "another sample"
         return "the same sample"

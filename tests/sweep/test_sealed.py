@@ -240,7 +240,7 @@ def test_a_scenario_that_was_edited_in_the_manifest_is_seen(copy, whole):
         shutil.copy(whole / "out" / "manifest.json", copy)
 
 
-@killed_by("cli.sweep", "    check_owner(folder, manifest, number)\n", "")
+@killed_by("scenario.samples", "    check_owner(folder, manifest, number)\n", "")
 def test_the_manifest_of_another_sweep_is_not_believed(copy, whole):
     """Nor by who reads no number of a chunk."""
     shutil.copy(whole / "other" / "manifest.json", copy)

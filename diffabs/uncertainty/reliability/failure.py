@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.types import Params, PyTree, Scalar, Table
+from diffabs.core.types import JsonObject, Params, PyTree, Scalar, Table
 from diffabs.core.units import resolve_unit, units_of
 from diffabs.engine.admissible import batch_admissibility
 from diffabs.engine.drive.engine import describe_engine, log_kernel, log_xla_reason, resolve_request
@@ -40,6 +40,7 @@ from diffabs.uncertainty.reliability.subset_simulation import (
 from diffabs.uncertainty.sweep.study import Study, noise_key, precision
 
 DIFFERENCE_STEP = 1e-4  # step in z: relative errors of 1e-9 (truncation) and 1e-12 (rounding)
+MAX_LISTED_FAILURES = 5
 MAX_BATCH = 1 << 17  # runs; their states and programs' temporaries are in memory at a time
 
 _Level = TypeVar("_Level", SubsetLevel, SubsetProgress)
@@ -133,6 +134,31 @@ def failure_probability(
     return dataclasses.replace(
         event, levels=[state_bound(level) for level in event.levels], engine=describe_engine(study.engine)
     )
+
+
+def describe_failures(event: RareEvent, study: Study, metric: str, bound: float) -> JsonObject:
+    """Return an estimate as JSON values, with the likeliest failures by path in SI, the likeliest first."""
+    rows = study.space.normal(event.failing[:MAX_LISTED_FAILURES]) if len(event.failing) else {}
+    return {
+        "metric": metric,
+        "bound": bound,
+        "unit": resolve_unit(getattr(study.objectives[metric], "unit", ""), units_of(study.loop.plant)),
+        "probability": event.probability,
+        "cov": event.cov,
+        "interval": list(event.interval),
+        "note": event.note,
+        "reason": event.reason.value,
+        "levels": [level._asdict() for level in event.levels],
+        "first level alone": event.plain._asdict(),
+        "subset simulation": event.subset._asdict(),
+        "importance sampling": event.importance.estimate._asdict() if event.importance else None,
+        "failures": {path: column.tolist() for path, column in rows.items()},
+        "runs": event.evaluations,
+        "gradients": event.gradients,
+        "diverged": event.diverged,
+        "seed": study.seed,
+        "engine": dict(event.engine),
+    }
 
 
 def _choose_engine(study: Study, metric: str) -> Study:

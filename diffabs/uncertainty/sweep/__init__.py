@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from diffabs.uncertainty.sweep.sampling import Random as Random
     from diffabs.uncertainty.sweep.sampling import Saltelli as Saltelli
     from diffabs.uncertainty.sweep.sampling import Sobol as Sobol
+    from diffabs.uncertainty.sweep.statistics.comparison import compare_sweeps as compare_sweeps
     from diffabs.uncertainty.sweep.store import SweepError as SweepError
     from diffabs.uncertainty.sweep.study import Study as Study
     from diffabs.uncertainty.sweep.variables import Correlation as Correlation

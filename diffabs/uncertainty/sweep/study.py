@@ -20,7 +20,7 @@ from diffabs.core.pytree import elements, get, parameters, replace
 from diffabs.core.types import Bool, Int, JsonObject, Params, Table
 from diffabs.core.units import resolve_unit, unit_at, units_of
 from diffabs.core.validity import find_problems
-from diffabs.engine.admissible import find_solver_faults
+from diffabs.engine.admissible import find_solver_faults, first_refusal
 from diffabs.engine.drive.engine import REQUESTABLE_ENGINES
 from diffabs.engine.types import Solver, describe_solver
 from diffabs.host.values import ScenarioError, as_plain, plain_fields, read_whole, unknown_name_error
@@ -138,6 +138,18 @@ class Study:
         values = {path: column[0] for path, column in self.draw(i, i + 1).items()}
         with precision("float64"):
             return replace(self.variant(values), self.numbers(values)), noise_key(self.seed, i)
+
+    def accepted_lane(self, i: int) -> tuple[Loop, jax.Array]:
+        """Return the `lane` of sample i.
+
+        Raises:
+            ValueError: The sample is not in the sweep.
+            ScenarioError: It was refused.
+        """
+        loop, key = self.lane(i)
+        if line := first_refusal(loop, {}, self.solver):
+            raise ScenarioError(f"sample {i} was refused: {line}")
+        return loop, key
 
     def numbers(self, values: Params) -> JsonObject:
         """Return the `values` by path that are numbers, and not names of parts."""

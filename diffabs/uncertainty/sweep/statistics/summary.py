@@ -12,16 +12,19 @@ read one at a time, so that ten million rows fit into memory. The design decides
 
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from scipy import stats
 
 from diffabs.core.types import JsonObject
+from diffabs.uncertainty.sweep.checking import check_accuracy
 from diffabs.uncertainty.sweep.results import Results
 from diffabs.uncertainty.sweep.statistics.estimates import Count, IntervalEstimate, Tail, summarise_column, varies
 from diffabs.uncertainty.sweep.statistics.replicated import Replicates
 from diffabs.uncertainty.sweep.statistics.rows import RowMasks
 from diffabs.uncertainty.sweep.statistics.sensitivity import correlations, sobol_indices
+from diffabs.uncertainty.sweep.study import Study
 
 CONFIDENCE, QUANTILE_LEVELS, CVAR_LEVEL = 0.95, (0.05, 0.5, 0.95), 0.95
 MAX_CORRELATED_SAMPLES = 200_000  # correlations use at most this number of samples, the first ones
@@ -83,6 +86,15 @@ def summarise_sweep(results: Results) -> JsonObject:
         "worst": {name: _worst_samples(results, view, name) for name in results.metrics},
         "digest": results.digest,
     }
+
+
+def summarise_checked_sweep(results: Results, study: Study, count: int) -> JsonObject:
+    """Return the summary with `accuracy`, that of `check_accuracy` for `count` runs; None without any."""
+    # Half steps run beside the statistics: compiled code and NumPy release Python's global lock.
+    with ThreadPoolExecutor(1) as beside:
+        halved = beside.submit(check_accuracy, study, results, count) if count else None
+        summary = summarise_sweep(results)
+    return {**summary, "accuracy": halved.result() if halved else None}
 
 
 def _list_samples(view: RowMasks, rows: np.ndarray) -> JsonObject:
