@@ -7,8 +7,6 @@ from typing import Annotated
 import typer
 
 from diffabs.cli import console, targets
-from diffabs.host import files
-from diffabs.host.values import ScenarioError
 
 DEFAULT_NAME = "report.html"
 ENDINGS = (".html", ".htm")
@@ -42,16 +40,10 @@ def report(
 
 
 def write_report_file(sources: Sequence[pathlib.Path], target: pathlib.Path, title: str = "") -> None:
-    """Write the report of all documents in folders or files. The file is written whole or not at all."""
-    from diffabs.output.report import ReportError, find_documents
-    from diffabs.output.report import build_report as made
+    """Write a report; see `write_report`, which needs the extra."""
+    from diffabs.output.report import write_report
 
-    try:
-        text = made([document for source in sources for document in find_documents(source)], title)
-    except ReportError as error:
-        raise ScenarioError(str(error)) from None
-    # Half of a surrogate pair (in JSON, in a file name) has no UTF-8; readers of HTML show its reference as U+FFFD.
-    files.write_file(target, text.encode(errors="xmlcharrefreplace"))
+    write_report(sources, target, title)
 
 
 def check_target(target: pathlib.Path) -> None:

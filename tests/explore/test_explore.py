@@ -860,7 +860,7 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
 
 
 @killed_by(
-    "cli.explore", "        if port is None:\n", "        if port is None and error.errno == errno.EADDRINUSE:\n"
+    "output.explore.server", "    except OSError:\n        if port is", "    except TimeoutError:\n        if port is"
 )
 def test_a_refused_usual_port_is_replaced(monkeypatch, file):
     pytest.importorskip("nicegui")

@@ -23,8 +23,7 @@ pytest.importorskip("matplotlib")
 
 from mutants import killed_by
 
-from diffabs.cli import report as reporting
-from diffabs.output.report import ReportError, build_report, find_documents
+from diffabs.output.report import ReportError, build_report, find_documents, writing
 from diffabs.output.report.charts import draw_lines
 from diffabs.output.report.writing import SECTION_BY_KIND
 from diffabs.uncertainty.sweep import Results as SweepResults
@@ -370,7 +369,7 @@ def test_lists_in_lists_are_one_line(results, tmp_path):
         build_report(find_documents(tmp_path / "x.json"))
 
 
-@killed_by("cli.report", 'errors="xmlcharrefreplace"', "")
+@killed_by("output.report.writing", 'errors="xmlcharrefreplace"', "")
 def test_half_of_a_surrogate_pair_is_a_replacement_character(results, tmp_path):
     """It is allowed in JSON and stands for the bytes of a file name that are no UTF-8; UTF-8 itself has none."""
     content = json.loads((results / "tune.json").read_text()) | {"scenario": "small \ud800"}
@@ -559,7 +558,7 @@ def test_the_old_report_stays_where_the_new_one_cannot_be_made(results, tmp_path
     before = out.read_bytes()
     (tmp_path / "x.json").write_text('{"free": {}, "history": [], "constraints": []}')
     command("report", tmp_path / "x.json", "-o", out, status=2)
-    monkeypatch.setattr(reporting.files, "write_file", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    monkeypatch.setattr(writing.files, "write_file", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
     assert_one_error_line(command("report", results / "tune.json", "-o", out, status=1))
     assert out.read_bytes() == before
     assert left_in(tmp_path) == {"report.html", "x.json"}

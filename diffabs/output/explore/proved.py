@@ -1,6 +1,8 @@
 """A proof's file and the values on the page: whether they lie in its box, and the bounds proved there."""
 
+import functools
 import pathlib
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -13,6 +15,7 @@ from diffabs.output.explore import friction
 from diffabs.output.explore.knobs import unit_words
 from diffabs.output.explore.session import CERTIFIED, NOT_PROVED, ProofVerdict, Session
 from diffabs.robust.reach.verification import ProofFile, read_proof
+from diffabs.scenario.proofs import read_proof_document
 from diffabs.scenario.scenario import Scenario, loads
 
 
@@ -28,6 +31,14 @@ class ProvedBox(NamedTuple):
     name: str
     content: ProofFile
     scenario: Scenario
+
+
+def load_judge(path: pathlib.Path) -> Callable[[Session], ProofVerdict]:
+    """Return the function that judges a session by a proof's file. Raises ValueError for another file."""
+    document = read_proof_document(path)
+    if document is None:
+        raise ValueError("is no certificate of prove" if path.exists() else "there is no such file")
+    return functools.partial(judge_values, load_proved_box(path, document))
 
 
 def load_proved_box(path: pathlib.Path, document: JsonObject) -> ProvedBox:

@@ -26,6 +26,19 @@ SHUTDOWN_S = 1  # s that open pages have to close their connections
 THREAD_SWITCH_S = 5e-4
 
 
+def open_listener(port: int | None, usual_port: int) -> socket.socket:
+    """Return a listening socket at a port; without one, at the usual port, or at any free one where that is in use.
+
+    It listens before the server starts, so that a port in use is reported at once.
+    """
+    try:
+        return socket.create_server((LOOPBACK_ADDRESS, usual_port if port is None else port))
+    except OSError:
+        if port is not None:
+            raise
+        return socket.create_server((LOOPBACK_ADDRESS, 0))
+
+
 def serve(
     source: str,
     tools: Tools,

@@ -22,6 +22,7 @@ from diffabs.output.explore import friction, knobs, tuning
 from diffabs.output.explore.knobs import Knob
 from diffabs.output.explore.panels import Spread
 from diffabs.scenario import registry
+from diffabs.scenario.proving import certify_result
 from diffabs.scenario.scenario import Scenario, load
 
 CERTIFIED, REFUTED, UNDECIDED, NOT_PROVED = "certified", "refuted", "undecided", "unknown"
@@ -37,6 +38,16 @@ class ProofVerdict(NamedTuple):
     sentence: str
 
 
+def prove_scenario(scenario: Scenario) -> ProofVerdict:
+    """Return the verdict on a scenario's gain over the ranges of its [design], "unknown" without any certificate."""
+    outcome = certify_result(scenario)
+    sentence = outcome.sentence.partition(": ")[2]
+    if not outcome.certified:
+        return ProofVerdict(NOT_PROVED, sentence)
+    words = {True: CERTIFIED, False: REFUTED, None: UNDECIDED}
+    return ProofVerdict(words[outcome.document["quadratically_stable"]], sentence)
+
+
 class Tools(NamedTuple):
     """The functions that need extras.
 
@@ -46,8 +57,8 @@ class Tools(NamedTuple):
         judge: Returns the verdict of a proof's file on the values of a session; None without a file.
     """
 
-    prove: Callable[[Scenario], ProofVerdict]
-    pose: Callable[[Scenario], tuning.TuningTask]
+    prove: Callable[[Scenario], ProofVerdict] = prove_scenario
+    pose: Callable[[Scenario], tuning.TuningTask] = tuning.pose_tuning
     judge: "Callable[[Session], ProofVerdict] | None" = None
 
 

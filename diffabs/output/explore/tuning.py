@@ -13,6 +13,7 @@ from diffabs.host.values import ScenarioError
 from diffabs.output.explore.knobs import Knob
 from diffabs.output.explore.stability import linear_stability, linearise_corners
 from diffabs.scenario.scenario import Scenario
+from diffabs.scenario.tuning import build_work
 
 if TYPE_CHECKING:
     from diffabs.tune.result import TuningProgress
@@ -25,6 +26,15 @@ class TuningTask(NamedTuple):
 
     batch: PyTree
     constraints: Sequence[PyTree]
+
+
+def pose_tuning(scenario: Scenario) -> TuningTask:
+    """Return runs and constraints of a scenario's [tune]."""
+    try:
+        work = build_work(scenario)
+    except ModuleNotFoundError as error:
+        raise ScenarioError(str(error)) from None
+    return TuningTask(work.batch, list(work.constraints.values()))
 
 
 class TuningFound(NamedTuple):

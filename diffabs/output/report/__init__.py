@@ -11,3 +11,4 @@ from diffabs.output.report.documents import ReportError as ReportError
 from diffabs.output.report.documents import find_documents as find_documents
 from diffabs.output.report.writing import build_report as build_report
 from diffabs.output.report.writing import is_report as is_report
+from diffabs.output.report.writing import write_report as write_report

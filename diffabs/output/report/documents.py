@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from diffabs.core.types import JsonObject
 from diffabs.host.documents import DocumentError, kind_of, read_document
-from diffabs.host.values import format_given
+from diffabs.host.values import ScenarioError, format_given
 
 SUMMARY, MANIFEST = "summary.json", "manifest.json"
 KEYS_BY_KIND = {  # the keys that only this kind has
@@ -25,7 +25,7 @@ CERTIFICATE_FORMAT = "diffabs certificate"  # a file with another `format` is no
 READABLE_DOCUMENTS = "reproduce, sweep, rare, tune, identify, prove --json, design and certify write"
 
 
-class ReportError(ValueError):
+class ReportError(ScenarioError):
     """An error: a source has no document, or a document cannot be read. The message is one line."""
 
 

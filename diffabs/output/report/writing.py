@@ -5,9 +5,10 @@ import pathlib
 from collections.abc import Callable, Sequence
 
 from diffabs import __version__
+from diffabs.host import files
 from diffabs.host.values import make_printable
 from diffabs.output.report import experiments, findings, proofs, studies
-from diffabs.output.report.documents import Document, ReportError
+from diffabs.output.report.documents import Document, ReportError, find_documents
 from diffabs.output.report.page import Section, shown_numbers
 
 MARK = b'<meta name="generator" content="diffabs report'  # near the start of every report
@@ -49,6 +50,23 @@ def build_report(documents: Sequence[Document], title: str = "") -> str:
         raise ReportError(
             f"{', '.join(str(document.path) for document in documents)}: values are nested too deeply"
         ) from None
+
+
+def write_report(sources: Sequence[pathlib.Path], target: pathlib.Path, title: str = "") -> None:
+    """Write the report of all documents in folders or files as one HTML file, whole or not at all.
+
+    Args:
+        sources: Folders or files, as for `find_documents`.
+        target: File to write.
+        title: Title of the report, as for `build_report`.
+
+    Raises:
+        ReportError: A source has no document, or one cannot be read.
+        OSError: The file cannot be written.
+    """
+    text = build_report([document for source in sources for document in find_documents(source)], title)
+    # Half of a surrogate pair (in JSON, in a file name) has no UTF-8; readers of HTML show its reference as U+FFFD.
+    files.write_file(target, text.encode(errors="xmlcharrefreplace"))
 
 
 def _section(document: Document) -> Section:
