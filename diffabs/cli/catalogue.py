@@ -6,15 +6,9 @@ from typing import Annotated
 import typer
 
 from diffabs.cli import console, show, targets
-from diffabs.core.types import JsonObject
-from diffabs.host import values
-from diffabs.scenario import registry
-from diffabs.scenario.scenario import dump, names, read_header
-
-PLURALS = {f"{name}s": name for name in ("plant", "road", "controller", "reference", "actuator", "sensor")}
-PLURALS |= {"feedforward": "feedforward", "antiwindup": "antiwindup", "initial": "initial"}
-PLURALS |= {"stops": "stop", "objectives": "objective"}
-LISTED_FAMILIES = (*PLURALS, "scenarios")
+from diffabs.host import documents, values
+from diffabs.scenario.catalogue import LISTED_FAMILIES, PLURALS, describe_family
+from diffabs.scenario.scenario import dump
 
 
 def families_like(incomplete: str) -> list[str]:
@@ -39,9 +33,9 @@ def list_parts(
             raise values.unknown_name_error(
                 f"there is no family {values.format_given(family)}", family, LISTED_FAMILIES
             )
-        result = {name: _describe_family(name) for name in LISTED_FAMILIES if family in (None, name)}
+        result = {name: describe_family(name) for name in LISTED_FAMILIES if family in (None, name)}
         if as_json:
-            return show.as_json(result)
+            return show.as_json(documents.stamp("list", result))
         for name, members in result.items():
             show.show_family(name, members)
     return None
@@ -62,18 +56,3 @@ def show_scenario(
         text = dump(console.load_scenario(scenario, changes, integrated=False))
         with targets.new_target_file(out, "--out") as file:
             file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
-
-
-def _describe_family(plural: str) -> JsonObject:
-    """Return the members of a family as plain values."""
-    if plural == "scenarios":
-        return {name: read_header(name) for name in names()}
-    family = PLURALS[plural]
-    return {
-        name: {
-            "summary": registry.part_summary(part),
-            **({"unit": registry.unit_of(part)} if family == "objective" else {}),
-            "parameters": registry.describe_part(family, part),
-        }
-        for name, part in registry.family_types(family).items()
-    }

@@ -18,6 +18,7 @@ from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import Array, JsonObject
 from diffabs.engine.drive.engine import EngineError
+from diffabs.host import documents
 from diffabs.host.values import ScenarioError, unknown_name_error
 from diffabs.loop.batch import Batch
 from diffabs.loop.ensemble import run_batch
@@ -113,11 +114,8 @@ def _count(scenario: Scenario, paths: list[str], values: LaneCall, derivative: L
         "jvp": derivative.lanes.derivative(derivative.seeds).program,
         "eliminate, with tangents": derivative.program(),
     }
-    return {
-        **console.describe_source(scenario),
-        "by": paths,
-        "operations": {name: count_by_level(program) for name, program in programs.items()},
-    }
+    operations = {name: count_by_level(program) for name, program in programs.items()}
+    return documents.stamp("compile", {**console.describe_source(scenario), "by": paths, "operations": operations})
 
 
 def _show(result: JsonObject, scenario: Scenario) -> None:

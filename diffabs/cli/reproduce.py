@@ -8,7 +8,8 @@ import typer
 
 from diffabs.cli import console, progress, report, show, targets
 from diffabs.core.types import JsonObject
-from diffabs.host import provenance, values
+from diffabs.host import documents, provenance
+from diffabs.host import values as readers
 
 if TYPE_CHECKING:
     from diffabs.papers import Reproduction
@@ -41,7 +42,7 @@ def reproduce(
 
         if name != "all" and name not in REPRODUCTIONS:
             names = (*REPRODUCTIONS, "all")
-            raise values.unknown_name_error(f"there is no paper {values.format_given(name)}", name, names)
+            raise readers.unknown_name_error(f"there is no paper {readers.format_given(name)}", name, names)
         if data is not None and name != "lab-rig":
             console.fail(f"--data {data}: only lab-rig reads measurements")
         if data is not None and not data.is_dir():
@@ -70,7 +71,8 @@ def reproduce(
         if whole:
             console.say(f"report of all papers: {whole}")
         if as_json:
-            show.as_json({"out": str(out), "papers": results, "versions": provenance.versions()})
+            values = {"out": str(out), "papers": results, "versions": provenance.versions()}
+            show.as_json(documents.stamp("papers", values))
 
 
 def _reproduce_with_progress(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> JsonObject:

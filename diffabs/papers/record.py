@@ -15,7 +15,7 @@ from rich.table import Table
 
 from diffabs.core.types import JsonObject, Params, Scalar
 from diffabs.engine.types import FixedStep, Run
-from diffabs.host import files, provenance
+from diffabs.host import documents, files, provenance
 from diffabs.output import plot
 from diffabs.papers.digest import Digest
 
@@ -74,7 +74,7 @@ def write_summary(
     """Write a summary atomically, with its digest if `compact` makes one, and return it as it reads back."""
     content = json.loads(json.dumps(summary, allow_nan=False))
     if compact:
-        content["digest"] = compact(content)._asdict()
+        content = documents.stamp("reproduce", {**content, "digest": compact(content)._asdict()})
     text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
     files.write_file(folder / name, f"{text}\n".encode())
     return json.loads(text)

@@ -13,18 +13,17 @@ from mutants import killed_by
 from seams import replace_seam
 
 import diffabs as d
-from diffabs.cli import catalogue
 from diffabs.compiler.runtime import toolchain
 from diffabs.papers.digest import Digest
 from diffabs.parts.objectives import BRAKING
-from diffabs.scenario import registry
+from diffabs.scenario import catalogue, registry
 
 # list
 
 
 def test_list_knows_every_part():
     document = json.loads(run("list", "--json").stdout)
-    assert set(document) == {*catalogue.PLURALS, "scenarios"}
+    assert set(document) == {*catalogue.PLURALS, "scenarios", "format"}
     for plural, family in catalogue.PLURALS.items():
         assert set(document[plural]) == set(registry.family_types(family))
     mass = document["plants"]["quarter-car"]["parameters"]["mass"]
