@@ -17,7 +17,7 @@ from diffabs.engine.arguments import prepare_arguments
 from diffabs.engine.result import prepare
 from diffabs.engine.step.attempt import start_state
 from diffabs.engine.step.comparisons import SwitchedProgram
-from diffabs.engine.step.system import build_system
+from diffabs.engine.step.system import split_flow_and_held, trace_program
 from diffabs.engine.types import Adaptive, Run, Solver
 
 FRAMES_OF_A_COMPARISON = 6  # calls that are read to find the line that compares, from the innermost one on
@@ -44,17 +44,19 @@ def describe_slide(loop: Loop, solver: Solver, objectives: Mapping[str, Objectiv
     )
 
 
-def _trace_program(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> SwitchedProgram | None:
+def _trace_program(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> SwitchedProgram:
+    # Not the program of the run: what JAX traces while it evaluates a primitive has the line of the primitive.
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
     loop, audit = prepare(loop)
     measured, zero = dict(objectives) | audit, jnp.zeros_like(method.h)
     state, accumulators = start_state(loop, measured, Clock(zero, method.h, jnp.asarray(0), None))
-    return build_system(loop, measured, zero, state, accumulators, switched=True).program
+    flow, held = split_flow_and_held(state, accumulators)
+    return trace_program((zero, *flow), (held, loop, measured))
 
 
-def _describe_comparison(program: SwitchedProgram | None, number: int) -> str:
+def _describe_comparison(program: SwitchedProgram, number: int) -> str:
     """Return the text, file and line of the comparison with this bit."""
-    for (first, shape), op in zip(program.places, program.origins, strict=True) if program else ():
+    for (first, shape), op in zip(program.places, program.origins, strict=True):
         if first <= number < first + int(np.prod(shape)):
             return _describe_line(op.source, op.name)
     return "a switching surface"

@@ -177,7 +177,9 @@ def main(config: Config | None = None, names: tuple[str, ...] = NAMES) -> dict[s
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
         kept, found = compared(config, name)
-        record.write_summary(folder, kept | {"gains": gains(config, {name: found})}, f"{name.replace(' ', '_')}.json")
+        record.write_summary(
+            folder, kept | {"gains": gains(config, {name: found})}, name=f"{name.replace(' ', '_')}.json"
+        )
     files = [folder / f"{name.replace(' ', '_')}.json" for name in NAMES]
     kept = [json.loads(path.read_text(encoding="utf-8")) for path in files if path.exists()]
     rows = [row for one in kept for row in lines(config, one)]

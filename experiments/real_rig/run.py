@@ -176,7 +176,7 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
         results[speed] = {"controllers": rows, "beyond the box": maps, "tuning": described(stages[speed])}
         (folder / "controllers").mkdir(parents=True, exist_ok=True)
         for name, one in loops.items():
-            record.write_summary(folder / "controllers", document(one), f"{speed}-{file_name(name)}.json")
+            record.write_summary(folder / "controllers", document(one), name=f"{speed}-{file_name(name)}.json")
     figures["tuning"] = descents(stages)
     told(f"{time.perf_counter() - begun:.0f} s")
     return record.experiment(config, results | {"seconds": time.perf_counter() - begun}, figures)

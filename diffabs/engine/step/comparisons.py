@@ -10,6 +10,7 @@ event location requires, and a derivative at a kink is one-sided.
 `inner_functions` says which functions are opened. Comparisons in the others stay unchanged, and are recorded as hidden.
 """
 
+import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -21,7 +22,6 @@ from jax._src.source_info_util import user_frame  # JAX has no public function t
 from jax.extend.core import JaxprEqn
 
 from diffabs.core.types import Array, Equation, PyTree, Scalar, Source
-from diffabs.engine.step import inner_functions
 from diffabs.engine.step.inner_functions import (
     SEARCHSORTED,
     Hidden,
@@ -32,6 +32,8 @@ from diffabs.engine.step.inner_functions import (
     open_equation,
 )
 from diffabs.engine.step.modes import WORD_BITS, BitRange, ComparisonAnswers, ComparisonTrace, Mode
+
+ENGINE = str(pathlib.Path(__file__).parents[1])  # no line of the engine has written a comparison of a loop
 
 
 class _Op(NamedTuple):
@@ -227,7 +229,7 @@ class SwitchedProgram:
 def _nearest_line(source: Source, caller: object) -> Any:
     """Return JAX's record `source` of an operation if it names a line of a user, and otherwise that of its caller."""
     frame = user_frame(source.traceback)
-    return source if caller is None or (frame and frame.file_name != inner_functions.__file__) else caller
+    return source if caller is None or (frame and not frame.file_name.startswith(ENGINE)) else caller
 
 
 def _bind_equation(eqn: JaxprEqn) -> Callable[..., Sequence[PyTree]]:

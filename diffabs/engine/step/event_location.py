@@ -188,8 +188,8 @@ def continue_search(
     seeking = SearchPlan(search, next, jnp.where(near, RunStatus.PROBING, RunStatus.SEEKING))
     # A step ends sqrt(eps) steps beyond a switching surface, so that the comparison has surely changed there.
     beyond = jnp.where(old.number < bit_count, base * jnp.finfo(base.dtype).eps ** OVERSHOOT_EXPONENT, 0.0)
-    search, next = _locate_event(old, length, crossings, beyond)
-    next, missed = _accept_location(search, length, next)
+    search, landing = _locate_event(old, length, crossings)
+    next, missed = _accept_location(search, length, landing, beyond)
     located = jnp.where(missed, RunStatus.SEEKING, RunStatus.REFINING if refines else RunStatus.LANDING)
     next_plan = select(status == RunStatus.PROBING, SearchPlan(search, next, located), seeking)
     if refines:
@@ -240,9 +240,7 @@ def _bracket_event(
     return search, jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier
 
 
-def _locate_event(
-    search: EventSearch, x: Scalar, crossings: AttemptCrossings, beyond: Scalar
-) -> tuple[EventSearch, PyTree]:
+def _locate_event(search: EventSearch, x: Scalar, crossings: AttemptCrossings) -> tuple[EventSearch, PyTree]:
     """Return the search with the margin's slope, and the length of the step that ends on the zero, after the probe.
 
     The slope is that of the parabola through the place, the probe, and one end of the first attempt. This is the end on
@@ -280,7 +278,7 @@ def _locate_event(
     has_tangent &= ~search.at_once | steep
     # For an event at the beginning of the step the length is clipped at 0 in value, but not in its derivative.
     at_once = jnp.where(steep, moved - jax.lax.stop_gradient(jnp.minimum(moved, 0.0)), 0.0)
-    return search._replace(fall=jnp.where(has_tangent, slope, 0.0)), jnp.where(search.at_once, at_once, moved) + beyond
+    return search._replace(fall=jnp.where(has_tangent, slope, 0.0)), jnp.where(search.at_once, at_once, moved)
 
 
 def refine(search: EventSearch, x: Scalar, crossings: AttemptCrossings) -> Scalar:
@@ -292,16 +290,17 @@ def refine(search: EventSearch, x: Scalar, crossings: AttemptCrossings) -> Scala
     return x - (remaining - jax.lax.stop_gradient(remaining)) / jnp.where(search.fall < 0, search.fall, -1.0)
 
 
-def _accept_location(search: EventSearch, x: Scalar, length: Scalar) -> tuple[PyTree, PyTree]:
+def _accept_location(search: EventSearch, x: Scalar, length: Scalar, beyond: Scalar) -> tuple[PyTree, PyTree]:
     """Return the length to try after the probe, and True if the search continues from the middle of the bracket.
 
-    It continues if the final step would end farther from `place` than the probe, or if the margin does not fall there.
-    A margin can be almost flat and then fall suddenly.
+    Without a further search it is the `length` to the zero, and the time [s] by which the step ends `beyond` it. The
+    search continues if the final step would end farther from `place` than the probe, or if the margin does not fall
+    there. A margin can be almost flat, or rise, and then fall suddenly.
     """
     probe, distance = jnp.abs(x - search.place), jnp.abs(length - search.place)
     missed = ((distance > probe) | ((distance == 0) & (search.margin != 0))) & (search.far - search.near > probe)
     again = jax.lax.stop_gradient(missed & ~search.at_once & (search.tries < MAX_LOCATION_ATTEMPTS))
-    return jnp.where(again, 0.5 * (search.near + search.far), length), again
+    return jnp.where(again, 0.5 * (search.near + search.far), length + beyond), again
 
 
 def _length_tangent(search: EventSearch, x: Scalar, g: AnyArray, zero: Scalar, fall: Scalar) -> Scalar:

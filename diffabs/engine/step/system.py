@@ -173,14 +173,17 @@ def build_system(
     if traced is None:
         while len(_traced) >= MAX_CACHED_SYSTEMS:
             _traced.pop(next(iter(_traced)), None)  # a dict keeps the order of insertion: the oldest goes first
-        # `counts`: only comparisons that influence rates or recorded signals produce a kink in the run.
-        program = (
-            SwitchedProgram(_evaluate_loop, *args, counts=lambda dynamics: (dynamics[:2], dynamics.signals.recorded))
-            if switched
-            else None
-        )
+        program = trace_program(*args) if switched else None
         traced = _traced[key] = program, _find_asked_rates(loop, objectives, t, state, accumulators, smooth=switched)
     return LoopSystem(traced[0], loop, objectives, traced[1], has_margin_rates)
+
+
+def trace_program(moving: PyTree, fixed: PyTree) -> SwitchedProgram:
+    """Return the program of the dynamics with visible comparisons, for the arguments of `_evaluate_loop`."""
+    # `counts`: only comparisons that influence rates or recorded signals produce a kink in the run.
+    return SwitchedProgram(
+        _evaluate_loop, moving, fixed, counts=lambda dynamics: (dynamics[:2], dynamics.signals.recorded)
+    )
 
 
 def _find_asked_rates(
