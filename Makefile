@@ -26,6 +26,7 @@ lint: $(VENV)/.lint $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --threads 2
+	$(BIN)/python tests/support/known_types.py
 	$(BIN)/lint-imports
 	$(BIN)/zizmor --offline --no-progress .github
 

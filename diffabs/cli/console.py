@@ -36,7 +36,7 @@ AWAKE = 0.1  # s between two checks for Ctrl-C
 LOUD = ("error:", "warning:", "verdict:", "interrupted")  # lines that --quiet does not silence
 CONTINUED = " \\"  # end of a shell's line that continues on the next
 WORKER = "diffabs worker"
-EXTRAS = {
+EXTRAS: dict[str, tuple[str, ...]] = {
     "sweep": ("filelock", "pyarrow", "scipy", "zarr"),
     "cluster": ("distributed",),
     "tune": ("optax", "scipy"),
@@ -251,7 +251,9 @@ class InterruptibleEnd:
 
     def __init__(self, step: str, nothing: Callable[[], bool] = lambda: False):
         """Store the `step` to finish, for messages, and `nothing`, which is true while there is no result."""
-        self.step, self.nothing, self.is_requested = step, nothing, False
+        self.step = step
+        self.nothing = nothing
+        self.is_requested: bool = False
 
     def __call__(self) -> bool:
         """Return True once Ctrl-C has requested the end."""

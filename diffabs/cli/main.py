@@ -40,7 +40,7 @@ from diffabs.host import compilation_cache, interrupt
 if COLLECTS:
     gc.enable()
 
-app = typer.Typer(
+app: typer.Typer = typer.Typer(
     no_args_is_help=True,
     cls=usage.Group,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -50,7 +50,7 @@ app = typer.Typer(
 )
 
 # A command's own arithmetic, whatever the environment says for other programs: without compilation it would take hours.
-JAX_FLAGS = {**jax_flags.DEFAULTS, "disable_jit": False, "enable_checks": False}
+JAX_FLAGS: dict[str, bool | str] = {**jax_flags.DEFAULTS, "disable_jit": False, "enable_checks": False}
 
 
 def main() -> NoReturn:

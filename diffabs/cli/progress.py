@@ -58,7 +58,7 @@ class WorkTiming:
 
     def __init__(self) -> None:
         """Start the clock."""
-        self.begun = time.monotonic()
+        self.begun: float = time.monotonic()
         self.first: tuple[float, float] | None = None  # time and amount of the first known progress
 
     def describe(self, far: WorkProgress) -> str:

@@ -45,8 +45,13 @@ class Node:
 
     def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: Any, level: UpdateLevel):
         """Store the fields. Only a `Graph` creates nodes."""
-        self.id, self.op, self.args, self.dtype, self.attr, self.level = id, op, args, dtype, attr, level
-        self.label = ""
+        self.id: int = id
+        self.op: str = op
+        self.args: tuple[Node, ...] = args
+        self.dtype: np.dtype = dtype
+        self.attr: Any = attr
+        self.level: UpdateLevel = level
+        self.label: str = ""
 
     def is_number(self, value: float) -> bool:
         """Return whether the node is a constant equal to `value`."""

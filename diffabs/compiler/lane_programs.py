@@ -37,7 +37,10 @@ class LanePrograms:
         read: tuple[int, ...] | None = None,
     ):
         """Store the functions and lower them to the program without tangents, so that an error appears at once."""
-        self.functions, self.launch, self.tangents_read, self.read = functions, launch, tangents_read, read
+        self.functions = functions
+        self.launch = launch
+        self.tangents_read = tangents_read
+        self.read = read
         self._derivatives: dict[PyTree, PyTree] = {}
         self.derivative(None)
 

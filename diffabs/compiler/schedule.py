@@ -17,8 +17,10 @@ class Branch:
 
     def __init__(self, gates: list[Node], yes: "ScheduleBlock", no: "ScheduleBlock"):
         """Create the conditional of `gates`, which share one number, with the blocks `yes` and `no`."""
-        self.gates, self.yes, self.no = gates, yes, no
-        self.condition = gates[0].args[0]
+        self.gates = gates
+        self.yes = yes
+        self.no = no
+        self.condition: Node = gates[0].args[0]
 
     @property
     def size(self) -> int:
@@ -34,7 +36,8 @@ class ScheduleBlock:
 
     def __init__(self, outer: "ScheduleBlock | None" = None):
         """Create an empty block inside `outer`, or an outermost block."""
-        self.outer, self.depth = outer, (outer.depth + 1 if outer else 0)
+        self.outer = outer
+        self.depth: int = outer.depth + 1 if outer else 0
         self.items: dict[int, Node | Branch] = {}
 
     @property

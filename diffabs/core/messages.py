@@ -3,9 +3,9 @@
 `core.protocols`, the page of contracts, re-exports these names.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,8 @@ from diffabs.core.cubic import Cubic
 from diffabs.core.types import Bool, Int, Key, PyTree, Scalar
 
 
-class BrakeOutput(NamedTuple):
-    """The outputs of a braking plant, which are also the signals of its sensor."""
+class BrakeSignals(NamedTuple):
+    """The fields of a `BrakeOutput`."""
 
     slip: Scalar  # [1] (v - r omega)/v
     speed: Scalar  # [m/s] of the vehicle
@@ -24,17 +24,19 @@ class BrakeOutput(NamedTuple):
     deceleration: Scalar  # [m/s^2] of the vehicle, positive in braking
     distance: Scalar  # [m] travelled
 
-    units = MappingProxyType({
+
+class BrakeOutput(BrakeSignals):
+    """The outputs of a braking plant, which are also the signals of its sensor."""
+
+    __slots__ = ()
+    units: ClassVar[Mapping[str, str]] = MappingProxyType({
         **{"slip": "1", "speed": "m/s", "wheel_speed": "m/s", "deceleration": "m/s^2", "distance": "m"},
     })  # fmt: skip
-    highest = 1.0  # greatest possible value of the first signal
+    highest: ClassVar[float] = 1.0  # greatest possible value of the first signal
 
 
-class BalanceOutput(NamedTuple):
-    """The outputs of a balancing plant, which are also the signals of its sensor.
-
-    The motor's torque under a voltage u is constant * clamp((u - emf)/resistance, -current_max, current_max).
-    """
+class BalanceSignals(NamedTuple):
+    """The fields of a `BalanceOutput`."""
 
     theta: Scalar  # [rad] frame, from the vertical
     psi: Scalar  # [rad] arm, from the frame
@@ -47,7 +49,15 @@ class BalanceOutput(NamedTuple):
     resistance: Scalar  # [ohm]
     current_max: Scalar  # [A]
 
-    units = MappingProxyType({
+
+class BalanceOutput(BalanceSignals):
+    """The outputs of a balancing plant, which are also the signals of its sensor.
+
+    The motor's torque under a voltage u is constant * clamp((u - emf)/resistance, -current_max, current_max).
+    """
+
+    __slots__ = ()
+    units: ClassVar[Mapping[str, str]] = MappingProxyType({
         **{"theta": "rad", "psi": "rad", "phi": "rad", "theta_rate": "rad/s", "psi_rate": "rad/s", "phi_rate": "rad/s"},
         **{"constant": "N m/A", "emf": "V", "resistance": "ohm", "current_max": "A"},
     })  # fmt: skip

@@ -16,7 +16,7 @@ from typing import BinaryIO
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux, <fcntl.h> and <linux/fs.h>
 NONBLOCKING_FLAG = getattr(os, "O_NONBLOCK", 0)  # without it, opening a pipe without a writer blocks for ever
 # Errors of a full, failing or read-only disk. A write to an open file raises them without the file's name.
-DISK_ERRORS = {errno.ENOSPC, errno.EFBIG, errno.EIO, errno.EROFS, getattr(errno, "EDQUOT", errno.ENOSPC)}
+DISK_ERRORS: set[int] = {errno.ENOSPC, errno.EFBIG, errno.EIO, errno.EROFS, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
 _unfinished: set[pathlib.Path] = set()
 

@@ -20,13 +20,13 @@ class ProgressLine:
             from IPython.display import display  # pyright: ignore[reportMissingImports]  # a notebook has it
 
             self.display = display
-        self.shown = self.display is not None or hasattr(sys, "ps1")
+        self.shown: bool = self.display is not None or hasattr(sys, "ps1")
         self.handle: Any = None
         self.text, self.at = "", -PERIOD_S
 
     def write(self, text: str) -> None:
         """Show this text, unless the last change was just now."""
-        self.text = text
+        self.text: str = text
         if self.shown and time.monotonic() - self.at >= PERIOD_S:
             self._show()
 
@@ -42,7 +42,7 @@ class ProgressLine:
                 sys.stderr.write("\n")
 
     def _show(self) -> None:
-        self.at = time.monotonic()
+        self.at: float = time.monotonic()
         if self.display is None:
             sys.stderr.write(f"\r\x1b[K{self.text}")
             sys.stderr.flush()

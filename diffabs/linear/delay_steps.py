@@ -69,11 +69,13 @@ class DelayedLoop:
 
         `largest` is then the largest |L| over all frequencies and delays.
         """
-        self.loop, self.period = loop, float(loop.period or 0.0)
+        self.loop = loop
+        self.period: float = float(loop.period or 0.0)
         self._plant = sample_plant(loop.plant, self.period, 0.0)
         powers, held = hold_input(loop.plant.A, loop.plant.B, self._rests())
         self._inputs, self._slopes = held[:, :, 0].T, (powers @ loop.plant.B)[:, :, 0].T
         self._longest = 0.0
+        self.largest: float
         self._curve, self._reaching, self.largest = self._trace(self._refine(w))
 
     def step(self, delay: float) -> DelayStep:

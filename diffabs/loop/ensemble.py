@@ -27,7 +27,7 @@ from diffabs.engine.run import run_unchecked
 from diffabs.engine.types import Run, Solver
 from diffabs.loop.batch import Batch
 
-log = logging.getLogger("diffabs")
+log: logging.Logger = logging.getLogger("diffabs")
 # Part of a message: why a batch cannot run in a kernel.
 TOGETHER_REASON = "lanes run together, for trajectories or for derivatives in either mode"
 TRACED_REASON = "the call is traced (jit, grad, vmap)"

@@ -99,15 +99,19 @@ class Designed:
     def __init__(self) -> None:
         """Compute the polytope, the gains for the reference weights, and the certificates."""
         model = SlipModel(plant=MirroredRig(), slip=0.2)
-        self.system = polytope(model, DESIGN_BOX)
-        self.designs = {weights: design(self.system, Spec(Q=weights, R=1.0)) for weights in REFERENCE_GAINS}
-        self.printed = {
+        self.system: Polytope = polytope(model, DESIGN_BOX)
+        self.designs: dict[tuple[float, float], Design] = {
+            weights: design(self.system, Spec(Q=weights, R=1.0)) for weights in REFERENCE_GAINS
+        }
+        self.printed: dict[tuple[float, float], Design] = {
             weights: design(_as_printed(self.system), Spec(Q=weights, R=1.0)) for weights in REFERENCE_GAINS
         }
         gains = {k2: (-K1, k2) for k2 in (-48.0, -76.6, -76.7, SAME_INTEGRAL[1])}
-        self.verdicts = {k2: certify(gain, self.system, fastest=True) for k2, gain in gains.items()}
+        self.verdicts: dict[float, Certificate] = {
+            k2: certify(gain, self.system, fastest=True) for k2, gain in gains.items()
+        }
         cells = schedule(model, DESIGN_BOX, along="speed", nodes=SPEED_CELLS)
-        self.varying = certify(PUBLISHED_GAIN, cells, Spec(rates=DECELERATION_RANGE, decay=5.0))
+        self.varying: Certificate = certify(PUBLISHED_GAIN, cells, Spec(rates=DECELERATION_RANGE, decay=5.0))
 
 
 def _as_printed(system: Polytope) -> Polytope:

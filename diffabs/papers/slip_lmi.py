@@ -78,7 +78,8 @@ GAIN_CASES = (
     Case("K = [-121.8, -158.2]", 5.3, gain=lmi_design.GENTLE),
 )
 
-CONVERGENCE = {  # expected order, and the step lengths of the fit: finer than the coarsest, with errors above rounding
+# Expected order, and the step lengths of the fit: finer than the coarsest, with errors above rounding.
+CONVERGENCE: dict[Case, tuple[float | None, slice]] = {
     CASES[6]: (4.0, slice(0, 4)),
     CASES[0]: (3.1, slice(3, 7)),
     CASES[2]: (None, slice(0, 7)),

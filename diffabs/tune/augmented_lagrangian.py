@@ -56,13 +56,16 @@ class AugmentedLagrangianSearch:
         The first start is the subject itself. The method draws the others at random from the ranges of the parameters.
         `progress` and `stopping` are those of `tune`.
         """
-        self.problem, self.method, self.progress, self.stopping = problem, method, progress, stopping
-        self.refused = problem.find_refusal()
+        self.problem = problem
+        self.method = method
+        self.progress = progress
+        self.stopping = stopping
+        self.refused: str | None = problem.find_refusal()
         if self.refused and method.starts == 1:
             raise StartError(f"{Reason.START.value}: {self.refused}")
         subject_start = problem.space.place(problem.subject)[None]
         drawn = problem.space.spread(jax.random.key(method.seed), method.starts - 1)
-        self.starts = np.concatenate([subject_start, drawn])
+        self.starts: np.ndarray = np.concatenate([subject_start, drawn])
         # Copies of the own start give the same batch shape as the search, so that both share one compiled program.
         alike = np.repeat(subject_start, len(self.starts), axis=0)
         self.before: ObjectiveEvaluation = jax.device_get(
@@ -71,8 +74,8 @@ class AugmentedLagrangianSearch:
         if self.refused:  # the results of inadmissible runs are meaningless
             self.before = jax.tree.map(lambda x: np.full(np.shape(x), np.nan), self.before)._replace(diverged=0, slid=0)
         size = abs(float(self.before.objective))
-        self.scale = size if np.isfinite(size) and size > 0 else 1.0
-        self.round = 0
+        self.scale: float = size if np.isfinite(size) and size > 0 else 1.0
+        self.round: int = 0
         self.earlier: list[list[DescentPoint]] = [[] for _ in self.starts]  # points of the earlier rounds
         self.best: DescentState | None = None  # snapshot of the best start so far
 

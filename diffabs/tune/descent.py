@@ -176,9 +176,13 @@ class Descent:
             interrupted: Called after `report`; True ends the descent of all starts.
             steepness: Maps z (p,) to the slope of each free parameter by z, relative to its slope at z = 0.
         """
-        self.evaluate, self.steady, self.stopping, self.report = evaluate, steady, stopping, report
-        self.interrupted, self.steepness = interrupted, steepness
-        self.searches = optimiser.searches
+        self.evaluate = evaluate
+        self.steady = steady
+        self.stopping = stopping
+        self.report = report
+        self.interrupted = interrupted
+        self.steepness = steepness
+        self.searches: bool = optimiser.searches
         self._init = jax.jit(jax.vmap(optimiser.transformation.init))
 
         def update(g: Matrix, state: object, z: Matrix, value: Scalar, m: Scalar) -> Any:
@@ -325,7 +329,7 @@ class Descent:
             again, restarted = self._update(g, self._init(z), z, loss, self.multipliers)
             updates = np.where(np.array(bad)[:, None], again, updates)
             states = _select_by_start(np.array(bad), restarted, states)
-        self.states = _select_by_start(np.array(fresh), states, self.states)
+        self.states: PyTree = _select_by_start(np.array(fresh), states, self.states)
         for descent_state, update, new in zip(descent_states, updates, fresh, strict=True):
             if new:
                 z, g = descent_state.z, descent_state.gradient

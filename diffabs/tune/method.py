@@ -29,7 +29,7 @@ class Stopping:
     change: float = 1e-7
     iterations: int = 100
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _check_whole("iterations", self.iterations, 0)
         _check_size("gradient", self.gradient)
         _check_size("change", self.change)
@@ -58,7 +58,7 @@ class Method:
     margin: float = 1e-3
     memory: int = 10
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _check_whole("starts", self.starts, 1)
         _check_whole("rounds", self.rounds, 0)
         _check_whole("memory", self.memory, 1)

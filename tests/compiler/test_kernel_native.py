@@ -239,7 +239,7 @@ def _long(x):
 
 @pytest.mark.slow
 @killed_by("compiler.emit.cpp", "and x is not branch.condition\n", "\n")
-@killed_by("compiler.emit.cpp", "self.rare = program, shape, RareNumbers({}, {})", "_ = program, shape, 0")
+@killed_by("compiler.emit.cpp", "self.rare: RareNumbers = RareNumbers({}, {})", "_ = 0")
 def test_a_conditional_may_ask_a_parameter_or_a_carried_truth():
     """The condition is known before a run, or the step reads it for nothing else."""
     x, flag, which = np.linspace(0.1, 0.9, 7), np.arange(7) % 2 == 0, np.arange(7) % 3.0

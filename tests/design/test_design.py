@@ -111,7 +111,7 @@ def test_one_vertex_is_the_closed_form_over_ten_decades():
         np.testing.assert_allclose(found.lower_bound, trace, rtol=1e-9)
 
 
-@killed_by("robust.design.sdp.program", "self.weight = weight / np.trace(weight)", "self.weight = np.eye(n) / n")
+@killed_by("robust.design.sdp.program", "np.ndarray = weight / np.trace(weight)", "np.ndarray = np.eye(n) / n")
 def test_four_vertices_agree_with_the_program_by_hand():
     random = np.random.default_rng(2)
     for q1, q2, r in 10.0 ** np.stack([random.uniform(0, 6, 8), random.uniform(0, 4, 8), random.uniform(-1, 1, 8)], 1):

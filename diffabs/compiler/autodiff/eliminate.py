@@ -29,12 +29,14 @@ class Elimination:
 
     def __init__(self, graph: Graph, many: int, dtype: np.dtype):
         """Create an empty linear graph."""
-        self.graph, self.many, self.algebra = graph, many, Algebra(graph, dtype)
+        self.graph = graph
+        self.many = many
+        self.algebra: Algebra = Algebra(graph, dtype)
         self.vertices: dict[int, Vertex] = {}
         self.readers: dict[int, set[int]] = {}
         self.required: set[int] = set()
         self.levels: dict[int, UpdateLevel] = {}
-        self.any_factor = graph.input(dtype, UpdateLevel.STEP, "any factor")
+        self.any_factor: Node = graph.input(dtype, UpdateLevel.STEP, "any factor")
 
     def add_input(self, node: int, level: UpdateLevel) -> None:
         """Add a tangent that is an input: `node` is its id, `level` tells how often its value changes."""

@@ -45,7 +45,10 @@ class Vertex:
         self, sum: Sum, condition: Node | None = None, true_sum: Sum | None = None, reads: tuple[int, ...] = ()
     ):
         """Store a tangent; the arguments are the attributes."""
-        self.sum, self.condition, self.true_sum, self.reads = sum, condition, true_sum or {}, reads
+        self.sum: Sum = sum
+        self.condition: Node | None = condition
+        self.true_sum: Sum = true_sum or {}
+        self.reads: tuple[int, ...] = reads
 
     def sums(self) -> tuple[Sum, ...]:
         """Return the sum, or both sums of a selection."""
@@ -62,7 +65,8 @@ class Algebra:
 
     def __init__(self, graph: Graph, dtype: np.dtype):
         """Store the graph, which grows with new factors."""
-        self.graph, self.dtype = graph, dtype
+        self.graph = graph
+        self.dtype = dtype
 
     def vertex(self, node: Node, moves: Callable[[Node], bool], value: Callable[[Node], Node]) -> Vertex:
         """Return the vertex of an operation on tangents: a sum, a selection between two sums, or a nonlinear one.

@@ -25,7 +25,7 @@ C_KEYWORDS = set(C_KEYWORDS_TEXT.split())
 # Macros of the headers that the texts include, which replace also a struct's field: NAN, EOF, INT64_MAX.
 C_MACRO = re.compile(r"[A-Z][A-Z0-9_]{2,}|L_tmpnam|math_errhandling|std(in|out|err)")
 C_FUNCTIONS = {name for row in OPERATIONS.values() for name in FUNCTION.findall(row.c99 or "")}
-RESERVED_NAMES = {*C_FUNCTIONS, "s", "p", "in", "i", "m", "t", "h"}  # names that a variable must not hide
+RESERVED_NAMES: set[str] = {*C_FUNCTIONS, "s", "p", "in", "i", "m", "t", "h"}  # names that a variable must not hide
 
 
 class Words:
@@ -39,7 +39,9 @@ class Words:
 
     def __init__(self, real: str, place: Callable[[str, str], str], single: bool = False):
         """Create a writer without variables; `place` maps (where, path) to the C expression of an input."""
-        self.real, self.place, self.single = real, place, single
+        self.real = real
+        self.place = place
+        self.single = single
         self._names: dict[int, str] = {}
         self._used_names = {*RESERVED_NAMES, real}
 

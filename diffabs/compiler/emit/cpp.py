@@ -111,10 +111,12 @@ class Text:
 
         `columns` has the name and a node of each table. The other operations are computed in every step.
         """
-        self.program, self.shape, self.rare = program, shape, RareNumbers({}, {})
-        self.roots = [node for nodes in program.results.values() for node in nodes]
+        self.program = program
+        self.shape = shape
+        self.rare: RareNumbers = RareNumbers({}, {})
+        self.roots: list[Node] = [node for nodes in program.results.values() for node in nodes]
         nodes = live_nodes(self.roots)
-        self.alive = {node.id for node in nodes}
+        self.alive: set[int] = {node.id for node in nodes}
         # Tables with the same entries share one column.
         self.columns: dict[tuple[int, ...], tuple[str, Node]] = {}
         for node in nodes:
@@ -122,10 +124,10 @@ class Text:
                 key = tuple(x.id for x in node.args[1:])
                 self.columns.setdefault(key, (f"t{len(self.columns)}", node))
         lanes = self._ids_read([node for node in nodes if node.level == UpdateLevel.STEP], self.roots, UpdateLevel.LANE)
-        self.lanes = [node for node in nodes if node.id in lanes]
+        self.lanes: list[Node] = [node for node in nodes if node.id in lanes]
         below = [node for node in nodes if node.level >= UpdateLevel.LANE]
         shared = self._ids_read(below, self.roots, UpdateLevel.UNIFORM)
-        self.shared = [node for node in nodes if node.id in shared and node.op != "const"]
+        self.shared: list[Node] = [node for node in nodes if node.id in shared and node.op != "const"]
 
     @staticmethod
     def _ids_read(readers: list[Node], roots: list[Node], level: UpdateLevel) -> set[int]:

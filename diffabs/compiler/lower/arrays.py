@@ -92,7 +92,7 @@ def _iota(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
 
 
 REDUCTION_OPERATIONS: dict[str, str] = {"sum": "add", "prod": "mul"}
-NEUTRAL_ELEMENTS = {"sum": 0, "prod": 1, "and": True, "or": False}
+NEUTRAL_ELEMENTS: dict[str, int] = {"sum": 0, "prod": 1, "and": True, "or": False}
 
 
 @lowering_rule("reduce_sum", "axes out_sharding")

@@ -34,7 +34,9 @@ class Unsupported(Exception):
     def __init__(self, primitive: str, reason: str):
         """Store `primitive` and `reason`; `reason` is text that continues a line after the primitive's name."""
         super().__init__(primitive, reason)
-        self.primitive, self.reason, self.method = primitive, reason, ""
+        self.primitive = primitive
+        self.reason = reason
+        self.method: str = ""
 
     def __str__(self) -> str:
         """Return the message, one line."""

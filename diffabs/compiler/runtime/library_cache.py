@@ -19,7 +19,7 @@ from diffabs.host import files
 CACHE = "DIFFABS_KERNEL_CACHE"  # environment variable: folder of the compiled libraries
 MAX_CACHE_BYTES = 1 << 28  # about 800 libraries; a larger cache loses its less recently used half
 CONTENT = 32  # hexadecimal digits of the content digest in a file name
-log = logging.getLogger("diffabs")
+log: logging.Logger = logging.getLogger("diffabs")
 
 
 def cache_folder() -> pathlib.Path:

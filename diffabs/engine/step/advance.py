@@ -79,7 +79,10 @@ class Carry(NamedTuple):
     control: PyTree
     status: Array
 
-    running = property(is_running)
+    @property
+    def running(self) -> Array:
+        """True if the run needs another attempt."""
+        return is_running(self)
 
 
 class Decision(NamedTuple):

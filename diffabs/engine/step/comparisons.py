@@ -82,7 +82,7 @@ class SwitchedProgram:
         moves = [True] * len(jax.tree.leaves(moving)) + [False] * len(jax.tree.leaves(fixed))
         self._inputs = [self._value(("in", i), on) for i, on in enumerate(moves)]
         flat = self._add_jaxpr(closed.jaxpr, self._add_constants(closed.consts), self._inputs)
-        self.outputs = jax.tree.unflatten(jax.tree.structure(shape), flat)
+        self.outputs: object = jax.tree.unflatten(jax.tree.structure(shape), flat)
         self._number_comparisons(set(jax.tree.leaves(counts(self.outputs))))
         self._operations: dict[tuple[int, ...], list[_Op]] = {}
 

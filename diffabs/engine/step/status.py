@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.loop import Loop
-from diffabs.core.types import Bool, PyTree, Scalar
+from diffabs.core.types import Array, PyTree, Scalar
 
 # A landing on the stop may leave at most this fraction of the margin's change in the step.
 MAX_MISSED_FRACTION = 0.1
@@ -37,7 +37,7 @@ class RunStatus(enum.IntEnum):
     DIVERGED, EXHAUSTED, MISSED, REFUSED, SLID, GRAZED = range(8, 14)
 
 
-def is_running(carry: PyTree) -> Bool:
+def is_running(carry: PyTree) -> Array:
     """Return True if the run needs another attempt."""
     return carry.status <= RunStatus.REFRESHING
 

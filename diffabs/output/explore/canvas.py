@@ -12,7 +12,7 @@ class Canvas:
 
     def __init__(self, options: JsonObject, classes: str, name: str = ""):
         """Put a chart with these `options` and CSS `classes` into the open element; `name` is its data-id."""
-        self.element = ui.echart(options).classes(classes)
+        self.element: ui.echart = ui.echart(options).classes(classes)
         if name:
             self.element.props["data-id"] = name
 

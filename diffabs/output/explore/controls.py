@@ -30,17 +30,20 @@ class Controls:
 
     def __init__(self, session: Session, turned: Turned, replaced: Replaced, widened: Widened):
         """Prepare the controls of a `session` with their callbacks; the page stays unchanged."""
-        self.session, self._change, self._replaced, self._widen = session, turned, replaced, widened
+        self.session = session
+        self._change = turned
+        self._replaced = replaced
+        self._widen = widened
         self.fields: JsonObject = {}
         self.sliders: JsonObject = {}
         self.refused: dict[str, Callable[[], None]] = {}  # by name of a marked field: shows its valid value again
-        self.sources = list(dict.fromkeys([session.source, *names()]))
+        self.sources: list[str] = list(dict.fromkeys([session.source, *names()]))
 
     def build(self) -> None:
         """Put the controls into the open column."""
-        self.message = ui.label().classes("refused").props("data-id=refused")
+        self.message: ui.label = ui.label().classes("refused").props("data-id=refused")
         self.message.set_visibility(False)
-        self.inside = ui.element("div").classes("rows")
+        self.inside: ui.element = ui.element("div").classes("rows")
         self._fill()
 
     def rebuild(self, fan: str = "") -> None:

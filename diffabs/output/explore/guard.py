@@ -38,10 +38,12 @@ class Guard:
 
     def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], port: int, token: str):
         """Protect `app`, served at `port`, with the secret `token` of its user."""
-        self.app, self.hosts = app, {f"{name}:{port}" for name in LOOPBACK_NAMES}
+        self.app = app
+        self.hosts = {f"{name}:{port}" for name in LOOPBACK_NAMES}
         self.hosts |= {*LOOPBACK_NAMES} if port == HTTP_PORT else set()
         # A browser sends a cookie to every port of a host, so the port is in its name.
-        self.token, self.cookie = token, f"diffabs-explore-{port}"
+        self.token = token
+        self.cookie: str = f"diffabs-explore-{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Forward a request, exchange its token for the cookie, or refuse it."""

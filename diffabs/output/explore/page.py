@@ -41,22 +41,25 @@ class Page:
         `tools` are the functions that need extras, `folder` is the folder for saved files, and `thread` is the name of
         the worker threads.
         """
-        self.session, self.tools = session, tools
-        self.client, self.server = ui.context.client, asyncio.get_running_loop()
-        self.version, self.turned_at = 0, 0.0
-        self.oldest_valid = 0  # earlier results are dropped: they are of another scenario, or of replaced numbers
-        self.drawn = 0  # version of the shown curve
+        self.session = session
+        self.tools = tools
+        self.client = ui.context.client
+        self.server: asyncio.AbstractEventLoop = asyncio.get_running_loop()
+        self.version: int = 0
+        self.turned_at: float = 0.0
+        self.oldest_valid: int = 0  # earlier results are dropped: they are of another scenario, or of replaced numbers
+        self.drawn: int = 0  # version of the shown curve
         self.shown: Curves | None = None
-        self.refused_version = 0  # version of a refusal, whose message stays
-        self.switching = asyncio.Lock()  # scenario and parts change one after the other
+        self.refused_version: int = 0  # version of a refusal, whose message stays
+        self.switching: asyncio.Lock = asyncio.Lock()  # scenario and parts change one after the other
         self.learned: dict[str, Any] = {}  # of this scenario: seconds of each step, and the corners computed last
-        self.corners_current = False  # whether the poles shown last had the corners of their own loop
+        self.corners_current: bool = False  # whether the poles shown last had the corners of their own loop
         self.drawer, self.thinker = (NewestJobThread(thread) for _ in range(2))
-        self.controls = Controls(session, self._change, self._replaced, self._widen)
-        self.results = ResultsPanel()
-        self.saver = Saver(session, folder)
+        self.controls: Controls = Controls(session, self._change, self._replaced, self._widen)
+        self.results: ResultsPanel = ResultsPanel()
+        self.saver: Saver = Saver(session, folder)
         reactions = Reactions(self.later, self.show_refusal, self._show_values, self.pin)
-        self.tuner = Tuner(session, tools.pose, reactions, thread)
+        self.tuner: Tuner = Tuner(session, tools.pose, reactions, thread)
         self.body: Any = None
         self.client.on_delete(self.end)
 
@@ -206,7 +209,7 @@ class Page:
     def _show_curves(self, run: Curves, now: Scenario, change: str, version: int, edit: int) -> None:
         if version < max(self.oldest_valid, self.drawn):
             return
-        self.drawn = version
+        self.drawn: int = version
         self.session.accept(now.loop)
         if self.chart is None:
             with self.place:

@@ -33,7 +33,7 @@ class ResultsPanel:
         with ui.element("div").classes("verdict stale").props("data-id=verdict") as self.verdict_box:
             self.word = ui.label("").style("font-weight:600; font-size:13.5px").props("data-id=word")
             self.why = ui.label("").classes("why")
-        self.proved_of = ui.label("").classes("note").props("data-id=proved-of")
+        self.proved_of: ui.label = ui.label("").classes("note").props("data-id=proved-of")
         with ui.element("div").classes("verdict").props("data-id=proved-box") as self.box_verdict:
             self.box_word = ui.label("").style("font-weight:600; font-size:13.5px")
             self.box_why = ui.label("").classes("why")
@@ -42,9 +42,9 @@ class ResultsPanel:
             ui.label("poles of the linearised loop")
             self.loop = ui.label("").classes("note").props("data-id=stable")
             self.solving = ui.label("computing …").classes("busy")
-        self.map = Canvas(charts.pole_chart(), "poles", "poles")
-        self.none = ui.label("").classes("note").props("data-id=about-poles")
-        self.poles_of = ui.label("").classes("note").props("data-id=poles-of")
+        self.map: Canvas = Canvas(charts.pole_chart(), "poles", "poles")
+        self.none: ui.label = ui.label("").classes("note").props("data-id=about-poles")
+        self.poles_of: ui.label = ui.label("").classes("note").props("data-id=poles-of")
         table = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
         self.margin_cells: dict[str, tuple[PyTree, PyTree]] = {}
         with table.props("data-id=margins"):
@@ -58,12 +58,14 @@ class ResultsPanel:
         with ui.element("div").classes("card-title"):
             ui.label("measured on the run")
             self.measuring = ui.label("computing …").classes("busy")
-        self.numbers = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
+        self.numbers: ui.element = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
         self.numbers.props("data-id=metrics")
 
     def begin(self, scenario: Scenario) -> None:
         """Prepare the panel for another scenario."""
-        self.units = {name: unit_of(objective, scenario.loop.plant) for name, objective in scenario.objectives.items()}
+        self.units: dict[str, str] = {
+            name: unit_of(objective, scenario.loop.plant) for name, objective in scenario.objectives.items()
+        }
         self.verdict_box.classes(replace="verdict stale")
         control = charts.QUANTITIES.get(scenario.loop.plant.control_unit, "control")
         for line in (self.proved_of, self.poles_of):

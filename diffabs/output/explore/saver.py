@@ -15,11 +15,12 @@ class Saver:
 
     def __init__(self, session: Session, folder: pathlib.Path):
         """Prepare the dialog for a `session`, whose files are written into `folder`; the page stays unchanged."""
-        self.session, self.folder = session, folder
+        self.session = session
+        self.folder = folder
 
     def build(self) -> None:
         """Put the closed dialog on the page."""
-        self.dialog = ui.dialog()
+        self.dialog: ui.dialog = ui.dialog()
 
     def ask(self) -> None:
         """Open the dialog."""

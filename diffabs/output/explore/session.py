@@ -100,7 +100,7 @@ class Session:
 
     def __init__(self, source: str):
         """Load the scenario from the path or name `source`."""
-        self.spread = Spread()
+        self.spread: Spread = Spread()
         self._begin(load_basis(source))
 
     def load_part(self, family: str, part: str) -> Basis:
@@ -186,7 +186,12 @@ class Session:
         return knob.pick(get(self._base.loop, knob.path) if value is None else value)
 
     def _begin(self, basis: Basis) -> None:
-        self.source, self.parts, self.original, self._base, self.knobs, self.first = basis
+        self.source: str = basis.source
+        self.parts: dict[str, str] = basis.parts
+        self.original: Scenario = basis.original
+        self._base: Scenario = basis.base
+        self.knobs: dict[str, Knob] = basis.knobs
+        self.first: list[str] = basis.first
         self.reset()
 
     def _start(self, accepted: Loop, values: dict[str, np.ndarray]) -> None:

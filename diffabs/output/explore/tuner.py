@@ -52,15 +52,17 @@ class Tuner:
 
     def __init__(self, session: Session, pose: Callable[[Scenario], tuning.TuningTask], page: Reactions, thread: str):
         """Prepare the tuner of a `session`, whose tasks `pose` makes; `thread` is the name of its thread."""
-        self.session, self.pose, self.page = session, pose, page
-        self.worker = NewestJobThread(thread)
+        self.session = session
+        self.pose = pose
+        self.page = page
+        self.worker: NewestJobThread = NewestJobThread(thread)
         self.stopping, self.running = False, False
         self.origin: Scenario | None = None
 
     def build(self) -> None:
         """Put the hidden card into the open column, and the closed dialog on the page."""
-        self.dialog = ui.dialog()
-        self.card = ui.element("div").classes("tuning").props("data-id=tuning")
+        self.dialog: ui.dialog = ui.dialog()
+        self.card: ui.element = ui.element("div").classes("tuning").props("data-id=tuning")
         self.card.set_visibility(False)
 
     def begin(self) -> None:
@@ -169,7 +171,7 @@ class Tuner:
         self.worker.ask(lambda: self._tune(scenario))
 
     def _stop(self) -> None:
-        self.stopping = True
+        self.stopping: bool = True
 
     # Methods that run in the tuning's thread.
     def _tune(self, scenario: Scenario) -> None:
@@ -214,7 +216,7 @@ class Tuner:
         self.page.show_refusal(error)
 
     def _show_result(self, scenario: Scenario, tuned: tuning.TuningFound, before: Curves, after: Curves) -> None:
-        self.running = False
+        self.running: bool = False
         if self.origin is None:
             return
         session = self.session

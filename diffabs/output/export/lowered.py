@@ -42,12 +42,18 @@ class Lowered:
         """Trace and lower start, step and move."""
         self.device = device
         graph = Labelled()
-        self.inputs = number_leaves(device.input, graph, INPUTS, lambda path: path.removeprefix("measured."))
-        self.numbers = number_leaves(device.parts, graph, NUMBERS, lambda path: path.removeprefix("controller."))
+        self.inputs: dict[str, Node] = number_leaves(
+            device.input, graph, INPUTS, lambda path: path.removeprefix("measured.")
+        )
+        self.numbers: dict[str, Node] = number_leaves(
+            device.parts, graph, NUMBERS, lambda path: path.removeprefix("controller.")
+        )
         # The field names flow and held in a memory path tell a reader nothing.
-        self.state = number_leaves(device.state, graph, MEMORY, lambda path: re.sub(r"\.(flow|held)(?=\.|$)", "", path))
+        self.state: dict[str, Node] = number_leaves(
+            device.state, graph, MEMORY, lambda path: re.sub(r"\.(flow|held)(?=\.|$)", "", path)
+        )
         values = [float(x) for leaf in jax.tree.leaves(device.parts) for x in np.asarray(leaf, float).flat]
-        self.values = dict(zip(self.numbers, values, strict=True))
+        self.values: dict[str, float] = dict(zip(self.numbers, values, strict=True))
         inputs, parts = fill_shapes(device.input, self.inputs), fill_shapes(device.parts, self.numbers)
         started = trace_outputs(
             graph, lambda both: device.start(*both), (device.parts, device.input), [*parts, *inputs]
@@ -55,7 +61,7 @@ class Lowered:
         held = fill_shapes(device.state, self.state)
         shapes = (device.parts, device.state, device.input)
         *after, self.held = trace_outputs(graph, lambda all: device.step(*all), shapes, [*parts, *held, *inputs])
-        self.place = graph.input(np.int64, UpdateLevel.UNIFORM, ("", "i"))
+        self.place: Node = graph.input(np.int64, UpdateLevel.UNIFORM, ("", "i"))
         moved: list[Node] = []
         if device.moves:
             place, count = np.full((), self.place, object), jax.ShapeDtypeStruct((), np.int64)
@@ -63,16 +69,20 @@ class Lowered:
             moved = trace_outputs(graph, lambda all: device.move(*all), shapes, [*parts, *held, place])
         # The reference's memory comes last in the state, and only `move` changes it.
         moving = dict(zip([*self.state][len(after) :], moved, strict=bool(moved)))
-        self.after = dict(zip(self.state, after, strict=False)) | moving
-        self.command = self.after["command"]
-        self.memory = self._find_memory()
-        self.moving = {name: node for name, node in moving.items() if name in self.memory}
-        self.begun = {name: node for name, node in zip(self.state, started, strict=True) if name in self.memory}
-        self.stored = {name: self.after[name] for name in self.memory if name in self.after and name not in moving}
+        self.after: dict[str, Node] = dict(zip(self.state, after, strict=False)) | moving
+        self.command: Node = self.after["command"]
+        self.memory: list[str] = self._find_memory()
+        self.moving: dict[str, Node] = {name: node for name, node in moving.items() if name in self.memory}
+        self.begun: dict[str, Node] = {
+            name: node for name, node in zip(self.state, started, strict=True) if name in self.memory
+        }
+        self.stored: dict[str, Node] = {
+            name: self.after[name] for name in self.memory if name in self.after and name not in moving
+        }
         roots = [self.held, *(self.after[name] for name in self.memory if name in self.after), *self.begun.values()]
         live = {node.id for node in live_nodes(roots)}
-        self.read = [name for name, node in self.inputs.items() if node.id in live]
-        self.used = [name for name, node in self.numbers.items() if node.id in live]
+        self.read: list[str] = [name for name, node in self.inputs.items() if node.id in live]
+        self.used: list[str] = [name for name, node in self.numbers.items() if node.id in live]
 
     def _find_memory(self) -> list[str]:
         """Return the names of the memory that the command depends on, from one sample to the next."""

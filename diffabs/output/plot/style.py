@@ -57,7 +57,9 @@ class Sheet(Figure):
         return picture.getvalue()
 
 
-def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float, float] = (5.4, 3.4), **kwargs: Any):
+def sheet(
+    rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float, float] = (5.4, 3.4), **kwargs: Any
+) -> tuple[Sheet, list[Axes]]:
     """Return an empty figure in the common style, and its axes as a list in reading order.
 
     Args:

@@ -4,7 +4,7 @@ Columns are in SI units. Variables that are speeds are drawn in km/h.
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,15 +52,22 @@ class SweepView:
 
     def __init__(self, results: Results, units: Mapping[str, str] = {}):
         """Select the rows and metrics of the sweep `results`; `units` are by the name of a column."""
-        self.results, self.units, self.bounds = results, units, results.study["failures"]
+        self.results = results
+        self.units = units
+        self.bounds: Mapping[str, Any] = results.study["failures"]
         masks = RowMasks(results)
-        self.design, self.period, self.accepted, self.good = masks.design, masks.period, masks.accepted, masks.good
-        self.rows = masks.good & masks.rows
+        self.design: str = masks.design
+        self.period: int = masks.period
+        self.accepted: np.ndarray = masks.accepted
+        self.good: np.ndarray = masks.good
+        self.rows: np.ndarray = masks.good & masks.rows
         rounding = LEVEL_ROUNDING_EPS * np.finfo(results.study["dtype"]).eps
         columns = ((name, results.column(name)[self.rows]) for name in results.metrics if self.rows.any())
         finite = ((name, x[np.isfinite(x)]) for name, x in columns)
-        self.varying = [name for name, x in finite if x.size and np.ptp(x) > rounding * max(1.0, np.abs(x).max())]
-        self.leading = next((name for name in [*self.bounds, *self.varying] if name in self.varying), "")
+        self.varying: list[str] = [
+            name for name, x in finite if x.size and np.ptp(x) > rounding * max(1.0, np.abs(x).max())
+        ]
+        self.leading: str = next((name for name in [*self.bounds, *self.varying] if name in self.varying), "")
 
     def known_rows(self, name: str, rows: np.ndarray) -> np.ndarray:
         """Return those of the `rows` in which the metric `name` is finite; both are Boolean masks, shape (runs,).

@@ -185,7 +185,7 @@ def draw_failure_map(results: Results, units: Mapping[str, str] = {}) -> Figure 
     figure, (ax,) = sheet(title=view.title(f"{np.sum(failed):,} failed of", np.sum(every)), size=(7.4, 5.0))
     if failed.any():
         table, words = bad / np.maximum(lanes, 1), "share of failed runs [1]"
-        colours = {"cmap": "Oranges", "vmin": 0, "vmax": np.max(table)}
+        colours: dict[str, Any] = {"cmap": "Oranges", "vmin": 0, "vmax": np.max(table)}
     else:
         values, greatest = results.column(view.leading)[every], np.full(lanes.size, -np.inf)
         np.maximum.at(greatest, cell, values)

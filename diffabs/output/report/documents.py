@@ -11,7 +11,7 @@ from diffabs.host.documents import DocumentError, kind_of, read_document
 from diffabs.host.values import ScenarioError, format_given
 
 SUMMARY, MANIFEST = "summary.json", "manifest.json"
-KEYS_BY_KIND = {  # the keys that only this kind has
+KEYS_BY_KIND: dict[str, tuple[str, ...]] = {  # the keys that only this kind has
     "reproduce": ("paper", "rows", "figures"),
     "sweep": ("digest", "sensitivity", "failures"),
     "rare": ("levels", "probability", "bound"),

@@ -16,7 +16,7 @@ from diffabs.output.report.documents import is_within
 IMAGES = {".png": "image/png", ".svg": "image/svg+xml"}
 LARGEST_IMAGE = 2**25  # bytes
 MAX_SHOWN_ENTRIES = 8  # of a list in a cell
-VERDICT_NAMES = {True: "proved", False: "disproved", None: "undecided"}
+VERDICT_NAMES: dict[bool | None, str] = {True: "proved", False: "disproved", None: "undecided"}
 
 
 class ShownNumber(NamedTuple):

@@ -31,7 +31,7 @@ from diffabs.parts.objectives.tracking import ShareAtLimit as ShareAtLimit
 from diffabs.parts.objectives.tracking import at_limits as at_limits
 
 # The papers on brakes use a band of +-0.01 in slip for every target.
-BRAKING = {
+BRAKING: dict[str, Objective] = {
     "stop_time": StopTime(),
     "stop_distance": StopDistance(),
     "max_slip": MaxSlip(),
@@ -42,7 +42,7 @@ BRAKING = {
     "locked_time": LockedTime(),
 }
 
-BALANCE = {
+BALANCE: dict[str, Objective] = {
     "settling_time": RestTime(),
     "peak_lean": PeakLean(),
     "peak_arm_angle": PeakArmAngle(),
@@ -52,7 +52,12 @@ BALANCE = {
     "fell": Fell(),
 }
 
-TRACKING = {"overshoot": Overshoot(), "settling_time": SettlingTime(), "iae": IAE(), "final_error": FinalError()}
+TRACKING: dict[str, Objective] = {
+    "overshoot": Overshoot(),
+    "settling_time": SettlingTime(),
+    "iae": IAE(),
+    "final_error": FinalError(),
+}
 
 
 def default_objectives(plant: Plant) -> dict[str, Objective]:

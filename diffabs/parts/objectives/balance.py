@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -31,8 +32,8 @@ class Fell(FinalValue):
     """
 
     unit = "1"
-    failure = 0.0  # a fall
-    physical = (0.0, 1.0)
+    failure: ClassVar[float] = 0.0  # a fall
+    physical: ClassVar[tuple[float, float]] = (0.0, 1.0)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return 1 if the run reached the stop, else 0."""
@@ -45,7 +46,7 @@ class FinalNorm(FinalValue):
     """sqrt(x'x) at the end of the run [1], x = (theta, psi, phi, theta', psi', phi') in rad and rad/s."""
 
     unit = "1"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return |x| of the last sample."""
@@ -75,7 +76,7 @@ class PeakLean(HeldValue):
     """Greatest |theta| of the frame [rad]."""
 
     unit = "rad"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     start, update = _greatest_angle("theta")
 
@@ -85,7 +86,7 @@ class PeakArmAngle(HeldValue):
     """Greatest |psi| of the arm [rad]."""
 
     unit = "rad"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     start, update = _greatest_angle("psi")
 
@@ -117,7 +118,7 @@ class PeakVoltage(HeldValue):
     """Greatest |u| at the motor [V]."""
 
     unit = "V"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     start, update = _greatest_size(lambda sample: jnp.abs(sample.control))
 
@@ -133,7 +134,7 @@ class PeakTorque(HeldValue):
     """Greatest absolute torque of the motor, without its friction [N m]."""
 
     unit = "N m"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     start, update = _greatest_size(lambda sample: jnp.abs(motor_torque(sample)))
 
@@ -148,7 +149,7 @@ class SoftLoss(FinalValue):
     """
 
     unit = "1"
-    physical = (0.0, 1.0)
+    physical: ClassVar[tuple[float, float]] = (0.0, 1.0)
 
     weight: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)
     """Weights of the squared states, shape (6,)."""
@@ -172,8 +173,8 @@ class RestTime(HeldValue):
     """
 
     unit = "s"
-    physical = (0.0, math.inf)
-    unreached = math.inf
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
+    unreached: ClassVar[float] = math.inf
 
     band: Scalar = param(default=0.01, unit="rad", above=0.0)
     """Half width of the band around upright."""
@@ -207,7 +208,7 @@ class BalanceCost(Integral):
     """
 
     unit = "rad^2 s"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     q: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)
     """Weights of the squared states, shape (6,)."""

@@ -1,7 +1,7 @@
 """Objectives of a braking run: time, distance, locked wheel, effort of the brake."""
 
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ class StopTime(FinalValue):
     """
 
     unit = "s"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return the time of the last sample plus the remaining time [s]."""
@@ -39,7 +39,7 @@ class StopDistance(FinalValue):
     """
 
     unit = "m"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return the distance of the last sample plus the remaining distance [m]."""
@@ -55,8 +55,8 @@ class LockedTime(HeldValue):
     """
 
     unit = "s"
-    failure = 0.0  # a wheel that locks
-    physical = (0.0, math.inf)
+    failure: ClassVar[float] = 0.0  # a wheel that locks
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     threshold: Scalar = param(default=0.99, unit="1", above=0.0, below=1.0)
     """Slip from which on the wheel counts as locked."""
@@ -76,7 +76,7 @@ class Effort(Integral):
     """
 
     unit = "control^2 s"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     def flow(self, memory: Memory, sample: Sample) -> Scalar:
         """Return u^2."""
@@ -105,7 +105,7 @@ class Variation(HeldValue):
     """
 
     unit = "control"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
     counts_kinks = True
 
     def start(self, sample: Sample) -> Memory:
@@ -144,7 +144,7 @@ class TorqueRate(HeldValue):
     """
 
     unit = "control/s"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     start, value = Variation.start, Variation.value
 

@@ -6,7 +6,7 @@ setpoint is the final value of the reference and not a filtered target on its wa
 
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -91,7 +91,7 @@ class IAE(HeldValue):
     """
 
     unit = "signal s"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the integral of |e| over the step."""
@@ -104,7 +104,7 @@ class ITAE(HeldValue):
     """Integral of t |e| dt, by the method of `IAE`, in the unit of y times s^2; for a slip [s^2]."""
 
     unit = "signal s^2"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the integral of t |e| over the step."""
@@ -125,7 +125,7 @@ class MaxSlip(HeldValue):
     """Greatest slip of the run [1], at most 1. Its derivative jumps where two maxima are equal."""
 
     unit = "1"
-    physical = (-1.0, 1.0)
+    physical: ClassVar[tuple[float, float]] = (-1.0, 1.0)
 
     def start(self, sample: Sample) -> Memory:
         """Return the first slip."""
@@ -150,8 +150,8 @@ class Overshoot(HeldValue):
     """
 
     unit = "1"
-    physical = (0.0, math.inf)
-    unreached = math.nan
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
+    unreached: ClassVar[float] = math.nan
 
     def start(self, sample: Sample) -> Memory:
         """Return the memory with the first value."""
@@ -202,8 +202,8 @@ class SettlingTime(HeldValue):
     """
 
     unit = "s"
-    physical = (0.0, math.inf)
-    unreached = math.inf
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
+    unreached: ClassVar[float] = math.inf
 
     share: Scalar = param(default=0.02, unit="1", low=0.0, below=1.0)
     """Half width of the band, relative to the step from the first value to the setpoint."""
@@ -249,7 +249,7 @@ class ShareAtLimit(HeldValue):
     """
 
     unit = "1"
-    physical = (0.0, 1.0)
+    physical: ClassVar[tuple[float, float]] = (0.0, 1.0)
 
     low: Scalar = param(default=-math.inf, unit="control", below=math.inf, infinite=True)
     """Lower limit of the control."""
@@ -307,7 +307,7 @@ class FinalError(FinalValue):
     """|y - setpoint| at the end of the run, in the unit of y."""
 
     unit = "signal"
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Return the final error."""
@@ -337,7 +337,7 @@ class QuadraticCost(Integral):
     """
 
     unit = ""
-    physical = (0.0, math.inf)
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
     q: Vector = param(default=(1.0, 1.0), unit="1", low=0.0)
     """Weights (q1, q2) of the squared states, shape (2,)."""

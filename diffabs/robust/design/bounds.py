@@ -35,8 +35,12 @@ class Bounds:
 
     def __init__(self, system: Polytope, k: np.ndarray, spec: Spec, frame: Frame):
         """Prepare the closed loops of gain `k` (m, n) on `system`; `frame` is one for quadratic stability."""
-        self.system, self.k, self.spec, self.frame = system, k, spec, frame
-        self.closed, self.discrete = system.closed_loop(k), system.period is not None
+        self.system = system
+        self.k = k
+        self.spec = spec
+        self.frame = frame
+        self.closed: np.ndarray = system.closed_loop(k)
+        self.discrete: bool = system.period is not None
 
     def cost(self) -> Claim | None:
         """Return the claim with the smallest trace P."""

@@ -14,7 +14,7 @@ from diffabs.robust.design.proof.schema import DISPROOF_KINDS
 from diffabs.robust.design.spec import Spec
 
 SCHEDULE_CELLS = 8  # cells of the speed range; the Lyapunov matrix is linear in the speed in each cell
-VERDICT_WORDS = {True: "proved", False: "disproved", None: "undecided"}
+VERDICT_WORDS: dict[bool | None, str] = {True: "proved", False: "disproved", None: "undecided"}
 
 
 class FurtherFindings(NamedTuple):

@@ -183,8 +183,10 @@ class Prover:
             first, shortest, longest: Lengths of the first, the shortest and the longest step [s]; paced loop: [s^2/m].
             order: Order of the Taylor polynomials; 0 for the usual one.
         """
-        e = self.equations = equations
-        self.signals, self.horizon = tuple(signals), horizon
+        e = equations
+        self.equations: Equations = equations
+        self.signals: tuple[str, ...] = tuple(signals)
+        self.horizon: float = horizon
         order = order or (CONTINUOUS_ORDER if equations.period is None else SAMPLED_ORDER)
         persistent, passing, quadratures = arrange_states(e, self.signals)
         states = [*persistent, *passing, *quadratures]
@@ -194,8 +196,9 @@ class Prover:
         for operation in e.operations:
             if operation.name == "clamp" and any(e.operations[x].name != "const" for x in operation.args[1:] if x >= 0):
                 raise NoRule("a limit that is not a number")
-        self.persistent, self.moving = persistent, [*persistent, *passing]
-        self.clockwork = [place[i] for i in clockwork_states(e, persistent)]
+        self.persistent: list[int] = persistent
+        self.moving: list[int] = [*persistent, *passing]
+        self.clockwork: list[int] = [place[i] for i in clockwork_states(e, persistent)]
         moving = len(persistent) + len(passing)
         roots = {
             "start": [e.start[i] for i in states],
@@ -205,11 +208,11 @@ class Prover:
         }
         self._arrays = {name: np.array(column, np.int32) for name, column in roots.items()}
         self._arrays |= _tape_arrays(e, place)
-        self.weights = np.ones((WEIGHT_TABLES, max(1, len(persistent))))
+        self.weights: np.ndarray = np.ones((WEIGHT_TABLES, max(1, len(persistent))))
         at = {name: column.ctypes.data for name, column in self._arrays.items()}
         columns = (at[name] for name in ("code", "a", "b", "c", "low", "high", "index"))
         low, high = decimal_ends(e.period) if e.period else (0.0, 0.0)
-        self.task = _Task(
+        self.task: _Task = _Task(
             _Tape(len(e.operations), *columns, len(e.params), moving),
             *(moving, len(persistent), len(quadratures)),
             *(at["start"], at["flow"], at["tick"], len(self.signals), at["signal"]),

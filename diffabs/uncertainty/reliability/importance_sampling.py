@@ -83,8 +83,12 @@ class CountedScore:
 
     def __init__(self, score: Score, gradient: Gradient | None, tolerated: float):
         """Set the score, its gradient (None: no gradient) and the share of runs that may diverge."""
-        self.score, self.slope, self.tolerated = score, gradient, tolerated
-        self.evaluations = self.gradients = self.diverged = 0
+        self.score = score
+        self.slope = gradient
+        self.tolerated = tolerated
+        self.evaluations: int = 0
+        self.gradients: int = 0
+        self.diverged: int = 0
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         self.evaluations += len(z)

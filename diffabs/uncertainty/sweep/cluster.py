@@ -56,7 +56,7 @@ class Dask:
     def __init__(self, scheduler: str | None = None, workers: int | None = None):
         """Set the cluster: `scheduler`, or else `workers` processes here, by default one for each core."""
         self.scheduler = scheduler
-        self.workers = core_count() if workers is None else read_whole(workers, 1, MAX_WORKERS, "workers")
+        self.workers: int = core_count() if workers is None else read_whole(workers, 1, MAX_WORKERS, "workers")
 
     @property
     def remote(self) -> bool:

@@ -3,7 +3,7 @@
 import dataclasses
 import reprlib
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -93,7 +93,7 @@ class Categorical(_Weighted):
 
     choices: tuple[float | str, ...]
     weights: tuple[float, ...] | None = None
-    scaled = ("choices",)
+    scaled: ClassVar[tuple[str, ...]] = ("choices",)
 
     @property
     def size(self) -> int:
@@ -136,7 +136,7 @@ class Empirical(_Discrete):
 
     values: tuple[float, ...]
     interpolated: bool = False
-    scaled = ("values",)
+    scaled: ClassVar[tuple[str, ...]] = ("values",)
 
     def value(self, u: ArrayLike) -> np.ndarray:
         method = "linear" if self.interpolated else "inverted_cdf"

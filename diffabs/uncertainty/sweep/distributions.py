@@ -96,7 +96,7 @@ class Uniform(_Continuous):
 
     low: float = param(unit="1")
     high: float = param(unit="1")
-    scaled = ("low", "high")
+    scaled: ClassVar[tuple[str, ...]] = ("low", "high")
 
     def _at(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         return np.clip(q * self.low + p * self.high, self.low, self.high)
@@ -115,7 +115,7 @@ class Normal(_Continuous):
     deviation: float = param(unit="1", above=0.0)
     low: float = param(default=-math.inf, unit="1", infinite=True)
     high: float = param(default=math.inf, unit="1", infinite=True)
-    scaled = ("mean", "deviation", "low", "high")
+    scaled: ClassVar[tuple[str, ...]] = ("mean", "deviation", "low", "high")
 
     def from_normal(self, z: ArrayLike) -> np.ndarray:
         """Return the quantile at Phi(z); linear in z without limits."""
@@ -159,7 +159,7 @@ class LogNormal(_Continuous):
     deviation: float = param(unit="1", above=0.0)
     low: float = param(default=0.0, unit="1", low=0.0)
     high: float = param(default=math.inf, unit="1", infinite=True)
-    scaled = ("median", "low", "high")
+    scaled: ClassVar[tuple[str, ...]] = ("median", "low", "high")
 
     def value(self, u: ArrayLike) -> np.ndarray:
         """Return the quantile at u in [0, 1]."""
@@ -191,7 +191,7 @@ class Triangular(_Continuous):
     low: float = param(unit="1")
     mode: float = param(unit="1")
     high: float = param(unit="1")
-    scaled = ("low", "mode", "high")
+    scaled: ClassVar[tuple[str, ...]] = ("low", "mode", "high")
 
     def _at(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         width, rise, fall = self.high - self.low, self.mode - self.low, self.high - self.mode

@@ -58,7 +58,7 @@ class Local:
 
     def __init__(self, devices: Sequence[PyTree] | None = None):
         """Set the `devices`; by default all local ones."""
-        self.devices = list(devices) if devices else None
+        self.devices: list[PyTree] | None = list(devices) if devices else None
 
     def places(self, study: Study) -> list[PyTree]:
         """Return the devices of the chunks that run at a time, one for each; a processor appears once for each core.

@@ -14,8 +14,9 @@ Format, study and versions own the chunks: each chunk contains their digest (`se
 import dataclasses
 import json
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject, PyTree, Table
@@ -80,11 +81,11 @@ class Seals:
 
     def __init__(self, manifest: Table):
         """Compute from the `manifest` the entries that all seals share."""
-        self.study = manifest["study"]
-        self.owner = json_digest({name: manifest[name] for name in OWNER_KEYS})
-        self.count = -(-self.study["samples"] // self.study["chunk"])
+        self.study: Table = manifest["study"]
+        self.owner: str = json_digest({name: manifest[name] for name in OWNER_KEYS})
+        self.count: int = -(-self.study["samples"] // self.study["chunk"])
         varied = variables.read_space(self.study["space"], "study.space").paths
-        self.columns = frozenset({"sample", *FLAG_COLUMNS, *self.study["objectives"], *varied})
+        self.columns: frozenset[str] = frozenset({"sample", *FLAG_COLUMNS, *self.study["objectives"], *varied})
 
     def of(self, chunk: int) -> Seal:
         """Return the seal of this chunk."""
@@ -140,7 +141,7 @@ def _read_utf8(text: PyTree, path: str) -> str:
     return text
 
 
-read_notes = table_reader(_read_utf8)
+read_notes: Callable[[PyTree, str], Any] = table_reader(_read_utf8)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -39,13 +39,14 @@ class Results:
             SweepError: The folder contains no sweep, no finished chunk, or one chunk twice. Methods that read chunks
                 raise it for damaged files.
         """
-        self.folder = pathlib.Path(folder)
-        self.manifest = read_manifest(self.folder)
+        self.folder: pathlib.Path = pathlib.Path(folder)
+        self.manifest: JsonObject = read_manifest(self.folder)
         self._seals = Seals(self.manifest)
-        named, self.strays = list_chunks(self.folder, self._seals.count)
+        named, strays = list_chunks(self.folder, self._seals.count)
+        self.strays: list[pathlib.Path] = strays
         if twice := next((paths for paths in named.values() if len(paths) > 1), None):
             raise SweepError(f"{twice[0]} and {twice[1].name} are the same chunk; --resume finds out which is damaged")
-        self.files = {chunk: paths[0] for chunk, paths in named.items()}
+        self.files: dict[int, pathlib.Path] = {chunk: paths[0] for chunk, paths in named.items()}
         self._verified: dict[int, tuple[int, ...]] = {}
         if not self.files:
             raise SweepError(f"{self.folder} has no finished chunk yet; --resume continues it")

@@ -62,8 +62,8 @@ class Runner:
     def __init__(self, study: Study, devices: Sequence[PyTree] | None = None):
         """Set the `study` and the `devices`, one for each block that runs at a time; by default all local ones once."""
         self.study = study
-        self.devices = list(devices or default_devices())
-        self.size = study.chunk if not study.parts else -(-study.chunk // BLOCKS_PER_CHUNK)
+        self.devices: list[PyTree] = list(devices or default_devices())
+        self.size: int = study.chunk if not study.parts else -(-study.chunk // BLOCKS_PER_CHUNK)
         self._pool = ThreadPoolExecutor(len(self.devices))
 
     def run(self, chunks: Sequence[int]) -> list[Columns]:

@@ -34,7 +34,8 @@ class Store:
 
     def __init__(self, folder: pathlib.Path):
         """Set the `folder`, without reading or writing."""
-        self.folder, self.chunks = pathlib.Path(folder), pathlib.Path(folder) / CHUNKS_FOLDER
+        self.folder: pathlib.Path = pathlib.Path(folder)
+        self.chunks: pathlib.Path = pathlib.Path(folder) / CHUNKS_FOLDER
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:

@@ -28,7 +28,9 @@ class Dyadic:
 
     def __init__(self, ints: Exact, bits: int, error: object = None) -> None:
         """Store `ints`, `bits` and `error` unchanged; `as_dyadic` and `as_uncertain_dyadic` convert floats."""
-        self.ints, self.bits, self.error = ints, bits, error
+        self.ints: Exact = ints
+        self.bits: int = bits
+        self.error: object = error
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -48,34 +48,39 @@ class DesignProgram:
 
     def __init__(self, system: Polytope | Schedule, whole: Polytope, spec: Spec, frame: Frame):
         """Lay out the unknowns for `system` under `spec` in `frame`; `whole` has all vertices of the system."""
-        self.system, self.spec, self.frame, self.period = system, spec, frame, whole.period
-        self.nodes = len(system.nodes) if isinstance(system, Schedule) else 1
+        self.system = system
+        self.spec = spec
+        self.frame = frame
+        self.period: float | None = whole.period
+        self.nodes: int = len(system.nodes) if isinstance(system, Schedule) else 1
         n, m = whole.order, whole.inputs
         shapes: dict[str, tuple[int, int] | int] = {}
         for i in range(self.nodes):
             shapes |= {f"X{i}": n, f"F{i}": (m, n), f"Z{i}": n}
         if spec.l2 is not None:
             shapes |= {"g": (1, 1)} if spec.l2.bound is None else {"s": (1, 1)}
-        self.unknowns = Unknowns(**shapes)
+        self.unknowns: Unknowns = Unknowns(**shapes)
         weight = frame.trace_weight()
         # Trace Z of the original coordinates is a weighted trace of the scaled Z. `scale` keeps the solver's objective
         # near 1.
-        self.scale = float(np.trace(weight)) if spec.Q is not None else 1.0
-        self.weight = weight / np.trace(weight)
+        self.scale: float = float(np.trace(weight)) if spec.Q is not None else 1.0
+        self.weight: np.ndarray = weight / np.trace(weight)
         # In the frame P = I and R = I, so K = -B' is the gain of the Riccati solution.
         k = -frame.inputs(whole.B[0]).T
-        self.output = self.disturbance = 1.0
+        self.output: float = 1.0
+        self.disturbance: float = 1.0
         if (l2 := spec.l2) is not None:
             # Units of z and w in which the gain of the frame's closed loop is about 1.
             z = np.linalg.norm(l2.output @ frame.T + l2.feedthrough @ frame.U @ k) / np.sqrt(frame.tau)
             e = whole.B[0] if l2.disturbance is None else l2.disturbance
             self.output = float(z) or 1.0
             self.disturbance = float(np.linalg.norm(frame.inverse @ e)) / np.sqrt(frame.tau) or 1.0
-        self.root, self.even = np.zeros((0, n)), np.eye(n)
+        self.root: np.ndarray = np.zeros((0, n))
+        self.even: np.ndarray = np.eye(n)
         if spec.Q is not None:
             weight = frame.weight(spec.Q)
             self.root, self.even = _root(weight), whitening_matrix(weight + k.T @ k)
-        self.common = list(self._common())
+        self.common: list[SdpBlock] = list(self._common())
 
     def objective(self) -> np.ndarray:
         """Return c (unknowns,) of the objective c'y: with Q and R, `scale` c'y is the mean of trace Z."""

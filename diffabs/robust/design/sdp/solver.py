@@ -66,13 +66,16 @@ class Unknowns:
         """Lay out the matrices of the given `shapes` in order."""
         self.basis: dict[str, np.ndarray] = {}
         units = {name: _units(shape) for name, shape in shapes.items()}
-        self.size, at = sum(map(len, units.values())), 0
+        self.size: int = sum(map(len, units.values()))
+        at = 0
         for name, unit in units.items():
             whole = np.zeros((self.size, *unit.shape[1:]))
             whole[at : at + len(unit)] = unit
             self.basis[name], at = whole, at + len(unit)
         # The first entry of a stack is the zero matrix: the formula gives h there, and h + G_d at the unit matrices.
-        self.stacked = {name: np.concatenate([np.zeros((1, *b.shape[1:])), b]) for name, b in self.basis.items()}
+        self.stacked: dict[str, np.ndarray] = {
+            name: np.concatenate([np.zeros((1, *b.shape[1:])), b]) for name, b in self.basis.items()
+        }
 
     def values(self, y: np.ndarray) -> dict[str, np.ndarray]:
         """Return the matrices in a vector `y`."""

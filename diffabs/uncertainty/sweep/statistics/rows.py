@@ -22,11 +22,12 @@ class RowMasks:
     def __init__(self, results: Results):
         """Read the masks of a sweep."""
         space = results.study["space"]
-        self.design = space["design"]["type"]
-        self.period = len(space["variables"]) + 2 if self.design == "saltelli" else 1
-        self.samples, self.accepted = results.column("sample"), results.accepted
-        self.good = self.accepted & ~results.column("diverged")
-        self.rows = self.samples % self.period == 0
+        self.design: str = space["design"]["type"]
+        self.period: int = len(space["variables"]) + 2 if self.design == "saltelli" else 1
+        self.samples: np.ndarray = results.column("sample")
+        self.accepted: np.ndarray = results.accepted
+        self.good: np.ndarray = self.accepted & ~results.column("diverged")
+        self.rows: np.ndarray = self.samples % self.period == 0
 
     def groups(self, values: np.ndarray) -> np.ndarray:
         """Return a column by groups of runs, shape (groups, period), without groups that miss a good, finite run."""
