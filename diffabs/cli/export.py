@@ -1,19 +1,16 @@
-"""The command `export`: a scenario's controller as C, Structured Text or a table, or its plant as an FMU."""
+"""The command `export`: a scenario's controller as C or Structured Text, or its plant as an FMU."""
 
 import dataclasses
 import enum
 import pathlib
-import re
 from typing import Annotated
 
 import numpy as np
 import typer
-from rich.table import Table
 
 from diffabs import __version__
-from diffabs.cli import console, show, tables, targets
+from diffabs.cli import console, targets
 from diffabs.engine.types import FixedStep
-from diffabs.host.provenance import versions
 from diffabs.host.values import ScenarioError
 from diffabs.parts.controllers import Sampled, SampledOnGrid
 from diffabs.scenario.scenario import Scenario
@@ -24,7 +21,6 @@ class Form(enum.StrEnum):
 
     C = "c"
     ST = "st"
-    TABLE = "table"
     FMU = "fmu"
 
 
@@ -38,9 +34,7 @@ def export(
     scenario: console.ScenarioName,
     to: Annotated[
         Form,
-        typer.Option(
-            help="Controller as C99, Structured Text (IEC 61131-3) or difference equations; or the plant as an FMU."
-        ),
+        typer.Option(help="Controller as C99 or Structured Text (IEC 61131-3), or the plant as an FMU."),
     ] = Form.C,
     changes: console.Changes = None,
     out: Annotated[
@@ -54,9 +48,6 @@ def export(
         float | None,
         typer.Option(metavar="SECONDS", help="Sample the scenario's continuous controller with this period."),
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="With --to table: print one JSON document to stdout.")
-    ] = False,
 ) -> None:
     """Write the sampled controller as code, or the plant as FMU.
 
@@ -64,11 +55,9 @@ def export(
     with console.end_on_errors():
         from diffabs.output.export import NotExported
 
-        if to is not Form.TABLE and as_json:
-            console.fail("--json is for --to table; code is text")
         if to is Form.FMU and out is None:
             console.fail("--to fmu needs a file: -o plant.fmu")
-        if to in (Form.TABLE, Form.FMU) and (single or extra_input):
+        if to is Form.FMU and (single or extra_input):
             console.fail("--float32 and --given are for --to c and --to st")
         if to is Form.FMU and period is not None:
             console.fail("--period is for a controller; --to fmu writes the plant")
@@ -78,11 +67,6 @@ def export(
             try:
                 if to is Form.FMU and file and out:
                     _write_fmu(setup, file, out)
-                    return
-                if to is Form.TABLE:
-                    _show_table(setup, file, as_json)
-                    if out:
-                        console.say(f"table: {out}")
                     return
                 text = console.run_with_progress(
                     lambda: _write_source(setup, out, to, single, extra_input), f"tracing {setup.name}"
@@ -112,8 +96,9 @@ def _sample_controller(scenario: Scenario, period: float) -> Scenario:
 
 def _function_prefix(scenario: Scenario, out: pathlib.Path | None) -> str:
     """Return the prefix of the functions' names, from the name of the file or of the scenario."""
-    name = re.sub(r"[\W_]+", "_", out.stem if out else scenario.name, flags=re.ASCII).strip("_")
-    return name if name[:1].isalpha() else f"controller_{name}".rstrip("_")
+    from diffabs.output.export import make_identifier
+
+    return make_identifier(out.stem if out else scenario.name)
 
 
 def _write_source(scenario: Scenario, out: pathlib.Path | None, to: Form, single: bool, extra_input: object) -> str:
@@ -141,29 +126,3 @@ def _write_fmu(scenario: Scenario, file: pathlib.Path, out: pathlib.Path) -> Non
     )
     file.write_bytes(data)
     console.say(f"fmu: {out}; FMI 2.0 for co-simulation, input control [{scenario.loop.plant.control_unit}]")
-
-
-def _show_table(scenario: Scenario, file: pathlib.Path | None, as_json: bool) -> None:
-    from diffabs.output.export import difference_equations
-
-    equations = console.run_with_progress(lambda: difference_equations(scenario.loop), f"linearising {scenario.name}")
-    states = [f"x{i + 1}" for i in range(len(equations["F"]))]
-    columns = [*states, *(f"d {name}" for name in equations["inputs"])]
-    rows = {f"{x}(k+1)": [*f, *g] for x, f, g in zip(states, equations["F"], equations["G"], strict=True)}
-    rows["d command(k)"] = [*equations["H"], *equations["J"]]
-    if file:
-        lines = [",".join(["", *columns]), *(",".join([name, *map(repr, row)]) for name, row in rows.items())]
-        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    if as_json:
-        show.as_json({"scenario": scenario.name, **equations, "versions": versions()})
-    elif not file:
-        table = Table("next", *columns)
-        for name, row in rows.items():
-            table.add_row(name, *(f"{value:.8g}" for value in row))
-        tables.show_titled_table(
-            f"{scenario.title or scenario.name}: every {1e3 * equations['period']:g} ms, at k", table
-        )
-        console.say(
-            "note: d is the deviation from rest at the setpoint, x the deviation of the controller's state; limits are"
-            " not included"
-        )

@@ -1,5 +1,6 @@
 """A controller as one file of C99: structs of memory and parameters, a start function and a step function."""
 
+import re
 from collections.abc import Iterator, Sequence
 
 import jax
@@ -10,6 +11,16 @@ from diffabs.compiler.ir import Node, live_nodes
 from diffabs.compiler.lower.rules import Unsupported
 from diffabs.output.export.device import ComputerProgram, NotExported
 from diffabs.output.export.lowered import INPUTS, MEMORY, NUMBERS, Lowered
+
+
+def make_identifier(text: str) -> str:
+    """Return a text, such as a file's name, as an identifier that code can have: ASCII letters, digits and lines.
+
+    Args:
+        text: Any text. One that does not begin with a letter gets the prefix `controller_`.
+    """
+    name = re.sub(r"[\W_]+", "_", text, flags=re.ASCII).strip("_")
+    return name if name[:1].isalpha() else f"controller_{name}".rstrip("_")
 
 
 def c_source(device: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
