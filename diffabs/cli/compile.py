@@ -3,25 +3,17 @@
 import pathlib
 from typing import Annotated
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 import typer
 from rich.table import Table
 
 from diffabs.cli import console, show, tables, targets
-from diffabs.compiler.listing import count_by_level
-from diffabs.compiler.lower.rules import Unsupported
-from diffabs.compiler.passes import PASSES, LaneCall, find_lane_calls, list_pass
+from diffabs.compiler.passes import PASSES
 from diffabs.compiler.runtime.jax_primitive import MAX_TANGENTS_PER_LAUNCH
-from diffabs.compiler.runtime.toolchain import NoCompiler
-from diffabs.core.pytree import get, parameters
-from diffabs.core.types import Array, JsonObject
-from diffabs.engine.drive.engine import EngineError
+from diffabs.core.types import JsonObject
 from diffabs.host import documents
 from diffabs.host.values import ScenarioError, unknown_name_error
-from diffabs.loop.batch import Batch
-from diffabs.loop.ensemble import run_batch
+from diffabs.loop.kernel_programs import KernelPrograms, trace_kernel, tunable_numbers
+from diffabs.scenario.model import describe_source
 from diffabs.scenario.scenario import Scenario
 
 
@@ -55,67 +47,38 @@ def compile_scenario(
         with targets.new_target_file(out, "--out") as file:
             setup = console.load_scenario(scenario, changes)
             paths = _differentiated_paths(setup, by or [])
-            values, derivative = console.run_with_progress(lambda: _trace(setup, paths), f"tracing {setup.name}")
+            programs = console.run_with_progress(lambda: _trace(setup, paths), f"tracing {setup.name}")
             if name:
-                # With --by every pass shows the program with tangents; without it only jvp, which values do not have.
-                call = derivative if by or name == "jvp" else values
-                text = console.run_with_progress(lambda: list_pass(call, name), f"pass {name}")
+                text = console.run_with_progress(lambda: programs.text(name, tangents=bool(by)), f"pass {name}")
                 file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
                 return
-            result = console.run_with_progress(lambda: _count(setup, paths, values, derivative), "counting")
-        show.as_json(result) if as_json else _show(result, setup)
+            counts = console.run_with_progress(programs.counts, "counting")
+        values = {**describe_source(setup), "by": paths, "operations": counts}
+        result = documents.stamp("compile", values)
+        show.show_result(as_json, _show, result, setup)
 
 
 def _differentiated_paths(scenario: Scenario, by: list[str]) -> list[str]:
     """Return the parameters to differentiate by: `by`, else the plant's first tunable number. Raises ScenarioError."""
-    tunable = {
-        path: spec
-        for path, spec, value in parameters(scenario.loop)
-        if spec.tunable and np.ndim(np.asarray(value)) == 0
-    }
-    if by:
-        for path in by:
-            if path not in tunable:
-                raise unknown_name_error(f"--by {path} is no tunable number of this loop", path, tunable)
-        if len(set(by)) != len(by):
-            raise ScenarioError(f"--by {', '.join(by)}: a parameter is given twice")
-        if len(by) > MAX_TANGENTS_PER_LAUNCH:
-            raise ScenarioError(f"--by is given {len(by)} times, outside [1, {MAX_TANGENTS_PER_LAUNCH}]")
-        return by
-    first = [path for path in tunable if path.startswith("plant.")] or list(tunable)
-    if not first:
+    tunable = tunable_numbers(scenario.loop)
+    for path in by:
+        if path not in tunable:
+            raise unknown_name_error(f"--by {path} is no tunable number of this loop", path, tunable)
+    if len(set(by)) != len(by):
+        raise ScenarioError(f"--by {', '.join(by)}: a parameter is given twice")
+    if len(by) > MAX_TANGENTS_PER_LAUNCH:
+        raise ScenarioError(f"--by is given {len(by)} times, outside [1, {MAX_TANGENTS_PER_LAUNCH}]")
+    paths = by or [path for path in tunable if path.startswith("plant.")][:1] or list(tunable)[:1]
+    if not paths:
         raise ScenarioError(f"{scenario.name} has no tunable number, by which a kernel could be differentiated")
-    return first[:1]
+    return paths
 
 
-def _trace(scenario: Scenario, paths: list[str]) -> tuple[LaneCall, LaneCall]:
-    """Return the kernel calls of one run: of its metrics, and of their derivatives by `paths`. Raises ScenarioError."""
-
-    def run(x: Array) -> dict[str, Array]:
-        values = {path: x[i][None] for i, path in enumerate(paths)}
-        lanes, options = Batch(values, jnp.zeros(1, int)), (scenario.solver, scenario.objectives)
-        return run_batch(scenario.loop, lanes, *options, together=False, engine="kernel").metrics
-
-    x = jnp.asarray([float(get(scenario.loop, path)) for path in paths])
+def _trace(scenario: Scenario, paths: list[str]) -> KernelPrograms:
     try:
-        jaxprs = [jax.make_jaxpr(function)(x) for function in (run, jax.jacfwd(run))]
-        values, derivative = (next(find_lane_calls(jaxpr)) for jaxpr in jaxprs)
-    except (EngineError, NoCompiler, Unsupported) as error:
+        return trace_kernel(scenario.loop, scenario.solver, scenario.objectives, paths)
+    except ValueError as error:
         raise ScenarioError(f"{scenario.name} has no kernel: {error}") from None
-    return values, derivative
-
-
-def _count(scenario: Scenario, paths: list[str], values: LaneCall, derivative: LaneCall) -> JsonObject:
-    """Return the numbers of operations by pass and level, for --json; `paths` are those of the tangents."""
-    programs = {
-        "lower": values.lanes.derivative(None).program,
-        "eliminate": values.program(),
-        "lower, for derivatives": derivative.lanes.derivative(None).program,
-        "jvp": derivative.lanes.derivative(derivative.seeds).program,
-        "eliminate, with tangents": derivative.program(),
-    }
-    operations = {name: count_by_level(program) for name, program in programs.items()}
-    return documents.stamp("compile", {**console.describe_source(scenario), "by": paths, "operations": operations})
 
 
 def _show(result: JsonObject, scenario: Scenario) -> None:

@@ -30,7 +30,7 @@ def test_the_numbers_of_operations():
 
 
 @pytest.mark.slow
-@killed_by("cli.compile", 'call = derivative if by or name == "jvp" else values', "call = values")
+@killed_by("loop.kernel_programs", 'self.derivative if tangents or name == "jvp" else self.values', "self.values")
 def test_a_program_is_shown_after_every_pass(tmp_path):
     texts = {name: run("compile", "slip-lmi", "--show", name).stdout for name in PASSES}
     assert len(set(texts.values())) == len(PASSES)
