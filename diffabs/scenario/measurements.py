@@ -38,6 +38,25 @@ class Readings(NamedTuple):
     infinite: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
 
+    def select(self, names: Sequence[str], where: str = "column") -> "Readings":
+        """Return the readings of these columns; without names, of all. Raises ScenarioError for an absent one."""
+        for name in names:
+            if name in self.infinite:
+                raise ScenarioError(f"{where} {name} is infinite in every row of the data")
+            if name not in self.columns:
+                raise unknown_name_error(f"{where} {format_given(name)} is not in the data", name, self.columns)
+        return Readings(self.t, {name: self.columns[name] for name in names or self.columns})
+
+
+def read_separator(text: str | None, where: str) -> str | None:
+    """Return the character between cells that a text names, None to guess it. Raises ScenarioError."""
+    if text is None:
+        return None
+    separator = {"tab": "\t", "\\t": "\t"}.get(text, text)
+    if len(separator) != 1 or separator.isalnum() or separator in "\"'+-.\r\n_":
+        raise ScenarioError(f"{where} {format_given(text)} is no separator: `tab`, or a character such as ;")
+    return separator
+
 
 def read_measurements(
     path: pathlib.Path,

@@ -9,10 +9,25 @@ from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Scalar
 from diffabs.core.units import units_of
 from diffabs.engine.types import describe_solver
+from diffabs.host import documents, provenance
 from diffabs.scenario import registry
 
 if TYPE_CHECKING:
     from diffabs.scenario.scenario import Scenario
+
+
+def describe_source(scenario: "Scenario") -> JsonObject:
+    """Return the entries that documents on a scenario begin with: "scenario", "model" and "made".
+
+    They hold its name, the values of `describe_model` and those of `describe_command`.
+    """
+    return {"scenario": scenario.name, "model": describe_model(scenario), "made": provenance.describe_command()}
+
+
+def result_document(kind: str, scenario: "Scenario", values: JsonObject, *packages: str) -> JsonObject:
+    """Return the JSON document of a result: its source, its values, the versions of `packages`, and no files yet."""
+    content = {**describe_source(scenario), **values, "versions": provenance.versions(*packages), "files": {}}
+    return documents.stamp(kind, content)
 
 
 def describe_model(scenario: "Scenario") -> JsonObject:

@@ -21,7 +21,10 @@ from typing import Any
 import numpy as np
 
 from diffabs.core import protocols
+from diffabs.core.loop import Loop
 from diffabs.core.types import Part, PyTree
+from diffabs.host.values import ScenarioError
+from diffabs.parts.roads.sign import find_wrong_sign
 
 ENTRY_POINT_GROUP = "diffabs.parts"
 CONTRACTS = {
@@ -195,3 +198,10 @@ def _import_module(name: str, whose: str) -> ModuleType:
     except (Exception, SystemExit) as error:
         line = describe_outside_error(error, [name]) or f"{type(error).__name__}: {error}"
         raise ValueError(f"{whose}: cannot be imported: {line}") from None
+
+
+def check_road(loop: Loop) -> None:
+    """Raise ScenarioError if modules are registered, and the friction of the loop's road has not the slip's sign."""
+    road = getattr(loop.plant, "road", None) if registered_modules() else None
+    if road is not None and (line := find_wrong_sign(road)):
+        raise ScenarioError(f"road: {line}")

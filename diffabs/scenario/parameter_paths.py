@@ -123,6 +123,14 @@ class ParameterEntry:
         return tuple(read_number(item, self.spec, f"{path}.{i}") for i, item in enumerate(value))
 
 
+def read_fixed_values(
+    table: Table, where: str, allowed: Mapping[str, tuple[ParameterSpec, tuple[int, ...]]]
+) -> dict[str, float]:
+    """Return the numbers of a table with parameter keys, in SI, by path of the loop."""
+    entries = [entry.single("be fixed") for entry in read_entries(table, where, allowed, "no parameter of this loop")]
+    return {entry.path: read_number_in_range(entry.value, entry.spec, entry.where) / entry.scale for entry in entries}
+
+
 class BoxSide(NamedTuple):
     """One parameter of a box.
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
-from diffabs.host.values import ScenarioError
+from diffabs.host.separated import read_decimal
+from diffabs.host.values import ScenarioError, format_given
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -77,6 +78,23 @@ def build_proof_task(
         raise ScenarioError(f"design.{error}; the states are {', '.join(states)}") from None
     solver.solvers()  # fails early if no SDP solver is installed
     return build_loop_task(scenario.loop, design.box(scenario.loop), spec, gain, reduced)
+
+
+def read_gain(text: str, states: Sequence[str], where: str = "--gain") -> np.ndarray:
+    """Return the gain of a text `k1,k2,...`, with a number for each of the states."""
+    words = text.strip().removeprefix("[").removesuffix("]").split(",")
+    try:
+        values = np.array([read_decimal(word) for word in words])
+    except ValueError:
+        raise ScenarioError(f"{where} {format_given(text)}: numbers are needed, as in {where}=-11753,-48") from None
+    if not np.isfinite(values).all():
+        raise ScenarioError(f"{where} {format_given(text)} is outside (-inf, inf): a gain is finite")
+    if len(values) != len(states):
+        raise ScenarioError(
+            f"{where} {format_given(text)} has {len(values)} of {len(states)} numbers, one for each of"
+            f" {', '.join(states)}"
+        )
+    return values
 
 
 def certify_result(scenario: Scenario) -> Proved:

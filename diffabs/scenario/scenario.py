@@ -365,3 +365,15 @@ def dump(scenario: Scenario) -> str:
     sections["objective"] = as_plain(scenario.objectives)
     sections |= {name: getattr(scenario, name).table() for name in ("design", "tune", "sweep")}
     return toml.write_toml({key: getattr(scenario, key) for key in TEXTS} | lists, sections)
+
+
+def field_paths(scenario: Scenario) -> list[str]:
+    """Return the paths of all fields of a scenario, as overrides name them, in the order of `dump`."""
+    pending, paths = list(toml.parse_toml(dump(scenario)).items())[::-1], []
+    while pending:
+        path, value = pending.pop()
+        if isinstance(value, dict):
+            pending += [(f"{path}.{key}", item) for key, item in value.items()][::-1]
+        else:
+            paths.append(path)
+    return paths

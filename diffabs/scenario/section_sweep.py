@@ -24,6 +24,7 @@ for files. Running the sweep needs the extra `sweep`.
 """
 
 import dataclasses
+import math
 import pathlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -39,9 +40,11 @@ from diffabs.host.values import (
     format_given,
     plain_fields,
     read_as_given,
+    read_number,
     read_text,
     table_field,
     table_reader,
+    unknown_name_error,
     whole_reader,
     wrong_kind_error,
 )
@@ -55,6 +58,7 @@ from diffabs.scenario.parameter_paths import (
     read_entries,
 )
 from diffabs.scenario.registry import build_part, describe_missing_inner_parts, family_of, unit_of
+from diffabs.scenario.toml import parse_value
 from diffabs.uncertainty.sweep import distributions, sampling
 from diffabs.uncertainty.sweep.variables import Correlation, Space, read_correlation
 
@@ -223,6 +227,22 @@ def _choice(key: str, value: PyTree, default: Any) -> Choice:
             raise ScenarioError("; ".join(lines))
         parts[name] = build_part(family, item, default, f"{where}.{i}")
     return Choice(value, drawn, parts)
+
+
+def read_failure(text: str, scenario: Any) -> tuple[str, float]:
+    """Return metric and bound, in SI, of a text `METRIC=BOUND`; without a bound, that of [sweep.failures]."""
+    metric, equals, bound = text.partition("=")
+    if metric not in scenario.objectives:
+        raise unknown_name_error(f"{metric} is not a metric of this scenario", metric, scenario.objectives)
+    if equals:
+        spec = ParameterSpec(unit_of(scenario.objectives[metric], scenario.loop.plant))
+        value = read_number(parse_value(bound.strip()), spec, metric)
+        if not math.isfinite(value):
+            raise ScenarioError(f"{metric} = {value:g} is outside {spec.interval()}")
+        return metric, value
+    if metric not in scenario.sweep.failures:
+        raise ScenarioError(f"{metric} has no bound in [sweep.failures]: say {metric}=BOUND")
+    return metric, scenario.sweep.failures[metric]
 
 
 def build_study(scenario: Any) -> "Study":

@@ -12,7 +12,8 @@ from diffabs.engine.faults import describe_faults
 from diffabs.engine.run import measure, rollout
 from diffabs.engine.sliding import describe_slide
 from diffabs.engine.types import Adaptive, Run, Solver, describe_solver
-from diffabs.loop.checking import describe_loose_metrics
+from diffabs.host.values import ScenarioError
+from diffabs.loop.checking import check_run_accuracy, describe_loose_metrics
 from diffabs.parts.objectives import at_limits
 from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
@@ -71,6 +72,13 @@ class Simulation(NamedTuple):
             return _run(dataclasses.replace(scenario, solver=other), self.key, self.max_rows)[0]
 
         return describe_loose_metrics(self.run.metrics, solver, run_again)
+
+    def accuracy(self) -> JsonObject:
+        """Return the accuracy of each metric, from further runs; see `check_run_accuracy`. Raises ScenarioError."""
+        try:
+            return check_run_accuracy(self.scenario.loop, self.scenario.solver, self.scenario.objectives, self.key)
+        except ValueError as error:
+            raise ScenarioError(str(error)) from None
 
     def slide(self) -> str:
         """Return one line about a slide of the run along a switching surface; empty without one."""

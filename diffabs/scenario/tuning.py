@@ -1,12 +1,14 @@
 """The task of a tuning, and the JSON values of its result."""
 
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from diffabs.core.bijectors import reached_bound
 from diffabs.core.pytree import get, parameters
-from diffabs.core.types import JsonObject, Part, Scalar
+from diffabs.core.types import JsonObject, Params, Part, Scalar
 from diffabs.engine.admissible import first_refusal
 from diffabs.host.values import ScenarioError
 from diffabs.scenario import proving
@@ -16,6 +18,7 @@ from diffabs.scenario.scenario import Scenario
 if TYPE_CHECKING:
     from diffabs.robust.design.loop_task import ProofTask
     from diffabs.tune import Batch, Tuned
+    from diffabs.tune.problem import Problem
 
 WHEN = ("before", "after")
 
@@ -53,6 +56,24 @@ def build_work(scenario: Scenario) -> Work:
     return Work(scenario, batch, constraints, task)
 
 
+def build_tuning(work: Work, engine: str = "auto") -> "Problem":
+    """Return the problem of a tuning, for `tune.tune` with the `engine` of its runs."""
+    from diffabs import tune
+
+    goal = work.scenario.tune
+    return tune.build_problem(
+        work.scenario.loop,
+        free=goal.free,
+        objective=goal.objective,
+        over=work.batch,
+        solver=work.scenario.solver,
+        measured=work.scenario.objectives,
+        aggregate=goal.read_aggregate(),
+        constraints=list(work.constraints.values()),
+        engine=engine,
+    )
+
+
 def describe_tuning(work: Work, tuned: "Tuned", proved: Proved) -> JsonObject:
     """Return the JSON values of a tuning and of the proof about its result."""
     scenario, goal = work.scenario, work.scenario.tune
@@ -76,6 +97,19 @@ def describe_tuning(work: Work, tuned: "Tuned", proved: Proved) -> JsonObject:
         "parameters": {path: _plain(value) for path, _, value in parameters(tuned.loop)},
         "certificate": proved.document,
     }
+
+
+def with_unproved(work: Work, result: JsonObject) -> JsonObject:
+    """Return the values of a tuning with its unchecked constraints added, as not met."""
+    names = [row["name"] for row in result["constraints"]]
+    goal = work.scenario.tune
+    bounds = {"certified decay": goal.decay, "damping": goal.damping}
+    unseen = [
+        {"name": name, "bound": bounds[name], "before": None, "after": None, "met": False, "missed": None}
+        for name in work.constraints
+        if name not in names
+    ]
+    return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
 
 
 def _free(scenario: Scenario, tuned: "Tuned", path: str) -> JsonObject:
@@ -131,3 +165,24 @@ def _least_damping(task: "ProofTask", loop: Part) -> float:
 
 def _plain(value: Scalar) -> Any:
     return np.asarray(value, float).tolist()
+
+
+def format_shortfall(row: JsonObject) -> str:
+    """Return the amount by which a constraint is not met, in words."""
+    if row["missed"] is None:
+        return "not known"
+    part = f" ({100 * row['missed'] / abs(row['bound']):.2g} %)" if row["bound"] else ""
+    return f"by {row['missed']:.3g}{part}"
+
+
+def numbers_at_bounds(free: Params) -> Iterator[str]:
+    """Yield each tuned number at a bound of its range, with the bound.
+
+    A number is at a bound if it is in the outer hundredth of its range (`reached_bound`).
+    """
+    for path, row in free.items():
+        after, low, high = np.broadcast_arrays(*(np.asarray(row[key], float) for key in ("after", "low", "high")))
+        for at in np.ndindex(after.shape):
+            name = ".".join([path, *map(str, at)])
+            if side := reached_bound(*(float(column[at]) for column in (low, high, after))):
+                yield f"{name} ({side}, {(low if side == 'lower' else high)[at]:g})"

@@ -2,9 +2,10 @@
 
 import pytest
 
-from diffabs.cli import certificates, margins, prove
+from diffabs.cli import margins, prove
 from diffabs.host.values import ScenarioError
 from diffabs.output.explore.session import Session
+from diffabs.scenario import proving
 from diffabs.scenario.scenario import load
 
 STRANGE = ["1_0", "\uff11\uff10", "\u0661\u0660", "1\u00a00"]  # Python's `float` takes the first three
@@ -20,7 +21,7 @@ def test_a_number_of_an_option_has_plain_digits(chosen, text):
     with pytest.raises(ScenarioError, match="a number is needed"):
         margins._read_places(chosen, [f"speed={text}"])
     with pytest.raises(ScenarioError, match="numbers are needed"):
-        certificates._read_gain(f"-1,{text}", ("a", "b"))
+        proving.read_gain(f"-1,{text}", ("a", "b"))
     with pytest.raises(ScenarioError, match="is not of the form path=low:high"):
         prove._read_sides([f"plant.mass=5:{text}"], chosen)
 

@@ -60,6 +60,6 @@ def test_a_record_has_a_row_for_each_number_with_its_deviation() -> None:
     (pair,) = record["correlations"]
     assert pair["between"] == ["gain.1", "gain.0"]
     assert pair["correlation"] < -0.95
-    statistics = describe_residuals(found, {"low": 1.0, "high": 2.0})
+    statistics = describe_residuals(found, {"low": 1.0, "high": 2.0}, {"low": "1", "high": "m"})
     assert statistics["high"]["largest"] == np.abs(found.residuals[25:]).max()
     assert statistics["low"]["mean"] == np.mean(found.residuals[:25])

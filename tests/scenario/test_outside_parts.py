@@ -131,7 +131,7 @@ def folder(tmp_path, monkeypatch) -> Iterator[None]:
 @killed_by("scenario.outside", 'value.dtype.kind in "OSU"', "False", case="none")
 @killed_by("parts.roads.sign", "mu * slips >= 0)", "mu * slips >= -9)", case="driving")
 @killed_by("parts.roads.sign", "slips == 0, abs(mu) <= MAX_FRICTION_AT_REST", "slips == 0, True", case="resting")
-@killed_by("cli.console", "if road is not None and (line", "if False and (line", case="negative")
+@killed_by("scenario.outside", "if road is not None and (line", "if False and (line", case="negative")
 @pytest.mark.parametrize(
     ("module", "text", "command", "line"), MISTAKES, ids=[readable_id(mistake[0]) for mistake in MISTAKES]
 )

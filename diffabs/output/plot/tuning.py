@@ -1,10 +1,14 @@
 """Figures of a tuning: convergence, runs before and after, and the front of two objectives."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
+import jax
 import numpy as np
 
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.engine.run import rollout
 from diffabs.engine.types import Trajectory
 from diffabs.output.plot.style import (
     COLOURS,
@@ -18,6 +22,10 @@ from diffabs.output.plot.style import (
     sheet,
     signal_label,
 )
+
+if TYPE_CHECKING:
+    from diffabs.scenario.tuning import Work
+    from diffabs.tune import Tuned
 
 MARKS = "osD^v"
 MAX_DECADES = 5.0  # an objective that falls by less is easier to read on a linear axis
@@ -33,6 +41,23 @@ def draw_tuning(
     _gradient(gradient, points)
     _runs(slip, torque, runs, lane and f"worst lane: {lane}", unit)
     return figure
+
+
+def draw_worst_run(work: "Work", tuned: "Tuned") -> Figure:
+    """Return the history of a scenario's tuning, and the run that is worst after it, before and after it."""
+    scenario, metrics = work.scenario, tuned.metrics[1]
+    worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in scenario.tune.objective.items())))
+    solver = dataclasses.replace(scenario.solver, every=min(scenario.solver.every, scenario.solver.steps))
+
+    def roll_out(loop: Part) -> Trajectory:
+        run = jax.device_get(rollout(work.batch.lane(loop, worst), solver, key=scenario.key()))
+        assert run.trajectory is not None
+        return run.trajectory
+
+    runs = {"before": roll_out(scenario.loop), "after": roll_out(tuned.loop)}
+    where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
+    title, unit = scenario.title or scenario.name, scenario.loop.plant.control_unit
+    return draw_tuning(tuned.history, runs, title=title, lane=where, unit=unit)
 
 
 def draw_pareto(

@@ -5,7 +5,8 @@ every fall of the speed that friction and resistances allow.
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -68,6 +69,18 @@ class ProofTask(NamedTuple):
             spec: Specification; by default that of the task.
         """
         return analysis.certify(self.gain, self.polytope, self.spec if spec is None else spec, fastest=True)
+
+    def notes(self) -> Iterator[str]:
+        """Yield what a proof about these systems leaves out or adds, one line each."""
+        yield from (f"neglected: {line}" for line in self.reduced.neglected)
+        if not self.reduced.exact:
+            yield "note: the linear model differs from the loop's linearisation; the proof is about the model"
+        spread = self.polytope.coverage.spread if self.polytope.coverage else 1.0
+        cover = "note: the corners do not cover the ranges; the vertices are"
+        if not self.polytope.corners:
+            yield f"{cover} the corners of a box around the systems"
+        elif not math.isclose(spread, 1.0):
+            yield f"{cover} spread by {spread:.4g}"
 
 
 def build_loop_task(

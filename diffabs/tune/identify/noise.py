@@ -92,7 +92,7 @@ def match_times(solver: Solver, t: np.ndarray) -> tuple[Solver, np.ndarray]:
     return solver, np.where(t <= end * (1 + FILE_ROUNDING), np.minimum(t, end), t)
 
 
-def describe_residuals(fit: Identified, sigma: Mapping[str, float]) -> JsonObject:
+def describe_residuals(fit: Identified, sigma: Mapping[str, float], units: Mapping[str, str]) -> JsonObject:
     """Return statistics of simulated minus measured by column, whose deviations `sigma` are in the order of the fit."""
     residuals = np.split(np.asarray(fit.residuals), len(sigma))
     return {
@@ -101,6 +101,7 @@ def describe_residuals(fit: Identified, sigma: Mapping[str, float]) -> JsonObjec
             "rms": root_mean_square(values),
             "mean": float(np.mean(values)),
             "largest": float(np.max(np.abs(values))),
+            "unit": units[name],
         }
         for name, values in zip(sigma, residuals, strict=True)
     }

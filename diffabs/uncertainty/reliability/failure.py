@@ -116,7 +116,10 @@ def failure_probability(
     if study.parts:
         raise ValueError(f"{', '.join(study.parts)}: alternatives of parts have no normal coordinates")
 
-    study = _choose_engine(study, metric)
+    is_auto = resolve_request(study.engine) == "auto"
+    study, why = choose_metric_engine(study, metric)
+    if is_auto:
+        log_xla_reason(why) if why else log_kernel()
 
     def score(z: np.ndarray) -> np.ndarray:
         return _run_scores(study, metric, z)
@@ -161,14 +164,13 @@ def describe_failures(event: RareEvent, study: Study, metric: str, bound: float)
     }
 
 
-def _choose_engine(study: Study, metric: str) -> Study:
-    """Return the study with engine "xla" or "kernel" for the runs of this metric."""
-    engine = resolve_request(study.engine)
+def choose_metric_engine(study: Study, metric: str) -> tuple[Study, str]:
+    """Return the study with engine "xla" or "kernel" for runs of one metric, and why "auto" became "xla", or ""."""
+    engine, why = resolve_request(study.engine), ""
     if engine == "auto":
-        line = describe_placement(()) or find_metric_objection(study, metric)
-        log_xla_reason(line) if line else log_kernel()
-        engine = "xla" if line else "kernel"
-    return dataclasses.replace(study, engine=engine)
+        why = describe_placement(()) or find_metric_objection(study, metric) or ""
+        engine = "xla" if why else "kernel"
+    return dataclasses.replace(study, engine=engine), why
 
 
 def find_metric_objection(study: Study, metric: str) -> str | None:

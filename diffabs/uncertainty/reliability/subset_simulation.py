@@ -31,7 +31,7 @@ consistent estimates adds a small bias.
 import dataclasses
 import enum
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -81,6 +81,13 @@ class SubsetProgress(NamedTuple):
     share: float
     evaluations: int
     strict: bool = False
+
+
+def describe_levels(levels: Sequence[SubsetProgress]) -> str:
+    """Return the threshold that is reached so far, with its probability and the number of runs, in words."""
+    probability, last = math.prod(level.share for level in levels), levels[-1]
+    reached = f"{'>' if last.strict else '>='} {last.threshold:.4g} has a probability of about {probability:.2g}"
+    return f"{reached}, by {last.evaluations:,} runs"
 
 
 class SubsetLevel(NamedTuple):

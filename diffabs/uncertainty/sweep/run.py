@@ -52,6 +52,20 @@ class SweepProgress(NamedTuple):
         failed = f", {self.failed} failed" if self.failed else ""
         return f"sweep: {self.samples:,} of {self.total:,} runs{failed}, {self.seconds:.0f} s"
 
+    def describe_count(self) -> str:
+        """Return the numbers of samples so far on one line, without times; before the first chunk it is compiling."""
+        words = f"{self.samples:,} of {self.total:,}"
+        if not self.here:
+            return f"{words}, compiling"
+        words += f": {self.rate:,.0f}/s, {self.failed:,} failed, {self.diverged:,} diverged"
+        return f"{words}, {self.refused:,} refused" if self.refused else words
+
+    def describe_damage(self) -> str:
+        """Return which chunks are damaged and computed again, on one line."""
+        count = len(self.damaged)
+        first = ", ".join(map(str, self.damaged[:8])) + (f" and {count - 8} more" if count > 8 else "")
+        return f"damaged, computed again: chunk{'s' if count > 1 else ''} {first}"
+
     @property
     def rate(self) -> float:
         """Samples of this call per second."""

@@ -45,8 +45,8 @@ def compare_sweeps(first: Results, second: Results, metrics: Sequence[str] = ())
     for results in (first, second):
         if not results.complete:
             raise SweepError(f"{results.folder} is not complete; diffabs sweep ... --resume completes it")
-    here, there = ({name: results.study[name] for name in SHARED_FIELDS} for results in (first, second))
-    for line in describe_differences(here, there):
+    first_fields, second_fields = ({name: results.study[name] for name in SHARED_FIELDS} for results in (first, second))
+    for line in describe_differences(first_fields, second_fields):
         difference = line.replace(" there, ", " in the first, ")
         raise SweepError(f"the samples are not the same: {difference} in the second")
     common = common_metrics(first, second)

@@ -1,0 +1,63 @@
+"""Margins of a scenario's loop, here and over the ranges of [design.over]."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from diffabs.core.pytree import replace
+from diffabs.core.types import JsonObject
+from diffabs.linear.robustness import Band, System, band
+from diffabs.linear.stability_margins import MARGIN_UNITS
+from diffabs.scenario.scenario import Scenario
+
+
+class ScenarioMargins(NamedTuple):
+    """The margins of a scenario.
+
+    Attributes:
+        values: Fixed values by path of the loop, in SI.
+        target: Setpoint; None for the loop's own.
+        over: Ranges (low, high) of the other parameters of [design.over], by path, in SI.
+        nominal: The loop at the fixed values.
+        band: The loops over the ranges; without systems if there are no ranges.
+    """
+
+    values: Mapping[str, float]
+    target: float | None
+    over: Mapping[str, tuple[float, float]]
+    nominal: System
+    band: Band
+
+    def record(self) -> JsonObject:
+        """Return the margins as JSON values, in SI."""
+        opened = self.nominal.loop
+        return {
+            "at": {**self.values} | ({} if self.target is None else {"target": self.target}),
+            "period": opened.period,
+            "delay_in_the_loop": opened.delay,
+            "order": len(opened.transfer().A),
+            "margins": self.nominal.margins.record(),
+            "units": MARGIN_UNITS,
+            "over": {path: list(ends) for path, ends in self.over.items()},
+            **self.band.record(),
+        }
+
+
+def examine_margins(
+    scenario: Scenario, values: Mapping[str, float] | None = None, target: float | None = None, samples: int = 32
+) -> ScenarioMargins:
+    """Return the margins of a scenario's loop, at its values and over the ranges of [design.over].
+
+    Args:
+        scenario: Loop and ranges.
+        values: Values by path of the loop, in SI, which replace the loop's own and their ranges.
+        target: Setpoint, as in `linear.open_loop`.
+        samples: Number of systems inside the ranges, added to the corners.
+
+    Raises:
+        ValueError: The loop has no linear model at a point.
+    """
+    values = dict(values or {})
+    loop = replace(scenario.loop, values)
+    over = {path: ends for path, ends in scenario.design.ranges(scenario.loop).items() if path not in values}
+    (nominal,) = band(loop, {}, 0, target).systems
+    return ScenarioMargins(values, target, over, nominal, band(loop, over, samples, target) if over else Band((), 0))
