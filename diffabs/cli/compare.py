@@ -33,4 +33,4 @@ def compare(
                 raise unknown_name_error(f"--metric {name} is not in both sweeps", name, common)
         result = {"first": str(first), "second": str(second), **compare_sweeps(a, b, metric or ())}
         result = documents.stamp("compare", result)
-        show.as_json(result) if as_json else show_samples.show_comparison(result)
+        show.show_result(as_json, show_samples.show_comparison, result)

@@ -9,7 +9,6 @@ import shlex
 import sys
 import textwrap
 import threading
-import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, NoReturn, TypeVar
@@ -18,15 +17,11 @@ import typer
 from rich.console import Console
 
 from diffabs.cli import progress
-from diffabs.core.types import JsonObject
 from diffabs.engine.drive.engine import EngineError
-from diffabs.host import documents, files, interrupt, provenance, stopwatch
+from diffabs.host import files, interrupt
 from diffabs.host.values import ScenarioError
-from diffabs.parts.roads.sign import find_wrong_sign
 from diffabs.scenario import outside
-from diffabs.scenario.model import describe_model
-from diffabs.scenario.scenario import Scenario, dump, load, names
-from diffabs.scenario.toml import parse_toml
+from diffabs.scenario.scenario import Scenario, field_paths, load, names
 
 T = TypeVar("T")
 
@@ -56,18 +51,9 @@ def fields_like(context: typer.Context, incomplete: str) -> list[str]:
     """Return completions of --set: the fields of the scenario on the line, as `show` writes them."""
     words = [context.params.get("scenario"), *context.args]  # an unfinished option leaves words unparsed here
     try:
-        tables = parse_toml(dump(load(next(filter(None, words)))))
+        return [f"{path}=" for path in field_paths(load(next(filter(None, words)))) if path.startswith(incomplete)]
     except (StopIteration, OSError, ValueError):
         return []
-    return [f"{path}=" for path in _field_paths(tables) if path.startswith(incomplete)]
-
-
-def _field_paths(tables: JsonObject, above: str = "") -> Iterator[str]:
-    for name, value in tables.items():
-        if isinstance(value, dict):
-            yield from _field_paths(value, f"{above}{name}.")
-        else:
-            yield f"{above}{name}"
 
 
 ScenarioName = Annotated[
@@ -86,44 +72,12 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result to stdout a
 
 
 _quiet = False
-_words: tuple[str, ...] = ()  # the words after `diffabs`
-_begun = time.monotonic()
 
 
 def quieten(quiet: bool) -> None:
     """Set whether lines other than errors, warnings and interruptions are suppressed."""
     global _quiet
     _quiet = quiet
-
-
-def note_command(words: Sequence[str]) -> None:
-    """Store the words after `diffabs` of the command that begins, and start its clock."""
-    global _words, _begun
-    _words, _begun = tuple(words), time.monotonic()
-    stopwatch.count_compilations()
-
-
-def describe_run() -> dict[str, str | float]:
-    """Return the origin of a document: command, date (UTC), machine, backend, commit, and the time so far.
-
-    "seconds" is the time [s] since `note_command`. "of it compiling" is the part [s] of it that JAX compiled.
-    """
-    seconds, compiling = time.monotonic() - _begun, stopwatch.compile_time_since(_begun)
-    return {**provenance.describe_making(_words), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
-
-
-def describe_source(scenario: Scenario) -> JsonObject:
-    """Return the entries that documents on a scenario begin with: "scenario", "model" and "made".
-
-    They hold its name, the values of `describe_model` and those of `describe_run`.
-    """
-    return {"scenario": scenario.name, "model": describe_model(scenario), "made": describe_run()}
-
-
-def document(kind: str, scenario: Scenario, values: JsonObject, *packages: str) -> JsonObject:
-    """Return the JSON document of a result: its source, its values, the versions of `packages`, and no files yet."""
-    content = {**describe_source(scenario), **values, "versions": provenance.versions(*packages), "files": {}}
-    return documents.stamp(kind, content)
 
 
 def escape_unencodable_output() -> None:
@@ -337,9 +291,7 @@ def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: b
     ScenarioError if the friction of a road has not the sign of the slip.
     """
     setup = run_with_progress(lambda: load(scenario, changes or (), integrated=integrated), "checking the scenario")
-    road = getattr(setup.loop.plant, "road", None) if outside.registered_modules() else None
-    if road is not None and (line := run_with_progress(lambda: find_wrong_sign(road), "checking the road")):
-        raise ScenarioError(f"road: {line}")
+    run_with_progress(lambda: outside.check_road(setup.loop), "checking the road")
     for line in setup.notes:
         say(f"note: {line}")
     for line in setup.cautions():

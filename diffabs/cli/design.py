@@ -144,8 +144,9 @@ def _prepare(
     scenario: str, changes: Sequence[str], gain: str | None = None, *, weighed: bool = False
 ) -> tuple[Scenario, "ProofTask"]:
     setup = console.load_scenario(scenario, changes, integrated=False)
+    read = None if gain is None else functools.partial(proving.read_gain, gain)
     return setup, console.run_with_progress(
-        lambda: certificates.read_proof_task(setup, gain, weighed=weighed), "computing the polytope"
+        lambda: proving.build_proof_task(setup, read, weighed=weighed), "computing the polytope"
     )
 
 
@@ -158,16 +159,7 @@ def _show(result: JsonObject, task: "ProofTask", as_json: bool) -> None:
         units = {path: spec.unit for path, spec, _ in parameters(task.model)}
         verdict = VERDICT_WORDS[result["quadratically_stable"]]
         show.show_proof(result, f"{result['scenario']}: u = K x", units, verdict)
-    for line in task.reduced.neglected:
-        console.say(f"neglected: {line}")
-    if not task.reduced.exact:
-        console.say("note: the linear model differs from the loop's linearisation; the proof is about the model")
-    spread = task.polytope.coverage.spread if task.polytope.coverage else 1.0
-    if not task.polytope.corners:
-        console.say(
-            "note: the corners do not cover the ranges; the vertices are the corners of a box around the systems"
-        )
-    elif not math.isclose(spread, 1.0):
-        console.say(f"note: the corners do not cover the ranges; the vertices are spread by {spread:.4g}")
+    for line in task.notes():
+        console.say(line)
     for path in result["files"].values():
         console.say(f"certificate: {path}; {CHECK} {path}")

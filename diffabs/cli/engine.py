@@ -1,13 +1,10 @@
 """The option `--engine`, which selects the program that makes the runs of a command."""
 
-from collections.abc import Callable
 from typing import Annotated
 
 import typer
 
-from diffabs.cli import console
 from diffabs.engine.drive.engine import REQUESTABLE_ENGINES, resolve_request
-from diffabs.engine.drive.sharding import describe_placement
 from diffabs.host.values import ScenarioError, unknown_name_error
 
 Engine = Annotated[
@@ -29,18 +26,3 @@ def check_engine_name(engine: str) -> None:
         if engine in REQUESTABLE_ENGINES:  # the environment variable has another name
             raise ScenarioError(str(error)) from None
         raise unknown_name_error(f"--engine {engine} is unknown", engine, REQUESTABLE_ENGINES) from None
-
-
-def choose_engine(engine: str, objection: Callable[[], str | None]) -> str:
-    """Return "xla" or "kernel", the engine that makes the runs.
-
-    "auto" becomes "kernel" unless there is an objection. A line on stderr then gives the reason for XLA. The
-    environment variable `DIFFABS_ENGINE` replaces "auto".
-    """
-    engine = resolve_request(engine)
-    if engine != "auto":
-        return engine
-    line = console.run_with_progress(lambda: describe_placement(()) or objection(), COMPILING_KERNEL)
-    if line:
-        console.say(XLA_NOTE.format(line))
-    return "xla" if line else "kernel"

@@ -16,7 +16,8 @@ from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject
 from diffabs.host.values import ScenarioError, format_given, read_number_in_range, unknown_name_error
 from diffabs.scenario import section_tune, toml
-from diffabs.scenario.measurements import Readings, read_measurements
+from diffabs.scenario.measurements import Readings, read_measurements, read_separator
+from diffabs.scenario.model import result_document
 from diffabs.scenario.parameter_paths import flatten_table
 from diffabs.scenario.scenario import Scenario, dump
 
@@ -74,13 +75,13 @@ def identify(
         with targets.new_target_file(out, "--out") as file:
             setup = console.load_scenario(scenario, changes)
             units = setup.loop.plant.shows.units
-            file_form = _read_renames(rename or ()), _read_separator(separator)
+            file_form = _read_renames(rename or ()), read_separator(separator, "--separator")
             readings = _compared_columns(data, column, units, *file_form)
             noise = _read_noise(sigma or (), readings, units)
             ranges = _read_ranges(free, setup)
             fit, noise, interrupted = _fit_with_progress(setup, readings, ranges, noise)
             result = {**_result(setup, readings, ranges, fit, noise), "interrupted": interrupted}
-            show_result = functools.partial(show.as_json if as_json else show.show_identification, result)
+            show_result = functools.partial(show.show_result, as_json, show.show_identification, result)
             if interrupted:
                 show_result()
                 console.say("interrupted: these are the values so far, not the best ones; no file is written")
@@ -109,16 +110,6 @@ def _read_renames(options: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def _read_separator(option: str | None) -> str | None:
-    """Return the character between the cells, or None to guess it."""
-    if option is None:
-        return None
-    separator = {"tab": "\t", "\\t": "\t"}.get(option, option)
-    if len(separator) != 1 or separator.isalnum() or separator in "\"'+-.\r\n_":
-        raise ScenarioError(f"--separator {format_given(option)} is no separator: `tab`, or a character such as ;")
-    return separator
-
-
 def _compared_columns(
     data: pathlib.Path,
     names: Sequence[str] | None,
@@ -133,15 +124,10 @@ def _compared_columns(
         console.say(f"note: not compared: {', '.join(readings.unread)}")
     if readings.infinite and not names:
         console.say(f"note: {', '.join(readings.infinite)} is infinite in every row of the data, and is not compared")
-    for name in names or ():
-        if name in readings.infinite:
-            raise ScenarioError(f"--column {name} is infinite in every row of the data")
-        if name not in readings.columns:
-            raise unknown_name_error(f"--column {format_given(name)} is not in the data", name, readings.columns)
-    columns = {name: readings.columns[name] for name in names or readings.columns}
-    if set(columns) >= DEPENDENT:
+    compared = readings.select(names or (), "--column")
+    if set(compared.columns) >= DEPENDENT:
         console.say(f"note: {REDUNDANT}")
-    return Readings(readings.t, columns)
+    return compared
 
 
 def _read_noise(options: Sequence[str], readings: Readings, units: Mapping[str, str]) -> dict[str, float]:
@@ -210,8 +196,7 @@ def _result(
     """Return the JSON document."""
     from diffabs.tune.identify.noise import describe_residuals
 
-    units, sigma = scenario.loop.plant.shows.units, {name: noise[name] for name in readings.columns}
-    residuals = {name: {**row, "unit": units[name]} for name, row in describe_residuals(fit, sigma).items()}
+    residuals = describe_residuals(fit, noise, scenario.loop.plant.shows.units)
     data = {"samples": len(readings.t), "columns": list(readings.columns), "until": float(readings.t[-1])}
     values = {"data": data, **fit.record(scenario.loop, ranges), "residuals": residuals}
-    return console.document("identify", scenario, values, "optax", "scipy")
+    return result_document("identify", scenario, values, "optax", "scipy")

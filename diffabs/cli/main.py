@@ -46,7 +46,6 @@ app: typer.Typer = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,  # plain help, for scripts and people
     pretty_exceptions_enable=False,
-    help="Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers.",
 )
 
 # A command's own arithmetic, whatever the environment says for other programs: without compilation it would take hours.

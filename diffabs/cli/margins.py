@@ -4,24 +4,22 @@ import math
 import pathlib
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.table import Table
 
 from diffabs.cli import console, show, tables, targets
-from diffabs.core.pytree import ParameterSpec, replace
+from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject
 from diffabs.host import documents, provenance
 from diffabs.host.separated import read_decimal
-from diffabs.host.values import ScenarioError, format_given, read_number_in_range
-from diffabs.linear.stability_margins import MARGIN_UNITS
-from diffabs.scenario.parameter_paths import parameters_of, read_entries
+from diffabs.host.values import ScenarioError, format_given
+from diffabs.linear.robustness import System
+from diffabs.scenario.parameter_paths import parameters_of, read_fixed_values
 from diffabs.scenario.registry import KMH
+from diffabs.scenario.robustness import ScenarioMargins, examine_margins
 from diffabs.scenario.scenario import Scenario
-
-if TYPE_CHECKING:
-    from diffabs.linear.robustness import Band, System
 
 MARGIN_NAMES = {
     **{"gain_up": "gain may rise to, times", "gain_down": "gain may fall to, times", "phase": "phase margin [deg]"},
@@ -61,15 +59,23 @@ def margins(
         with targets.new_target_file(plot, "--plot") as picture:
             setup = console.load_scenario(scenario, changes, integrated=False)
             values, target = _read_places(setup, at or ())
-            nominal, over = _find_margins(setup, values, target, samples)
-            result = _document(setup, nominal, over, values, target)
-            show_result = partial(show.as_json, result) if as_json else partial(_show, result, setup, nominal, over)
+            try:
+                margin_results = console.run_with_progress(
+                    lambda: examine_margins(setup, values, target, samples), f"linearising {setup.name}"
+                )
+            except ScenarioError:
+                raise
+            except ValueError as error:
+                console.fail(f"{setup.name}: {error}", console.FAILED)
+            result = {"scenario": setup.name, **margin_results.record(), "versions": provenance.versions(), "files": {}}
+            result = documents.stamp("margins", result)
+            show_result = partial(show.show_result, as_json, _show, result, setup, margin_results)
             if picture:
                 with console.show_before_errors(show_result):
-                    console.run_with_progress(lambda: _draw(setup, nominal, over, picture), "drawing")
+                    console.run_with_progress(lambda: _draw(setup, margin_results, picture), "drawing")
         result["files"] |= {"plot": str(plot)} if plot else {}
         show_result()
-        _judge(setup, nominal, over)
+        _judge(setup, margin_results)
 
 
 def _read_places(scenario: Scenario, options: Sequence[str]) -> tuple[dict[str, float], float | None]:
@@ -86,65 +92,24 @@ def _read_places(scenario: Scenario, options: Sequence[str]) -> tuple[dict[str, 
             raise ScenarioError(f"--at {path} is given twice")
         table[path] = value
     allowed = {**parameters_of(scenario.loop), "target": (ParameterSpec("1"), ())}
-    entries = [entry.single("be fixed") for entry in read_entries(table, "--at", allowed, "no parameter of this loop")]
-    values = {entry.path: read_number_in_range(entry.value, entry.spec, entry.where) / entry.scale for entry in entries}
+    values = read_fixed_values(table, "--at", allowed)
     return values, values.pop("target", None)
 
 
-def _find_margins(
-    scenario: Scenario, values: dict[str, float], target: float | None, samples: int
-) -> tuple["System", "Band"]:
-    """Return the loop at these values, and over the other ranges. Raises typer.Exit for a loop without linear model."""
-    from diffabs.linear.robustness import Band, band
-
-    loop, over = replace(scenario.loop, values), _ranges(scenario, values)
-    try:
-        here = console.run_with_progress(lambda: band(loop, {}, 0, target), f"linearising {scenario.name}")
-        work = partial(band, loop, over, samples, target)
-        return here.systems[0], console.run_with_progress(work, "over the ranges") if over else Band((), 0)
-    except ValueError as error:
-        console.fail(f"{scenario.name}: {error}", console.FAILED)
-
-
-def _ranges(scenario: Scenario, values: dict[str, float]) -> dict[str, tuple[float, float]]:
-    """Return the ranges of [design.over] whose parameters have no fixed value."""
-    return {path: ends for path, ends in scenario.design.ranges(scenario.loop).items() if path not in values}
-
-
-def _draw(scenario: Scenario, nominal: "System", over: "Band", picture: pathlib.Path) -> None:
+def _draw(scenario: Scenario, margins: ScenarioMargins, picture: pathlib.Path) -> None:
     from diffabs.output.plot import frequency
 
-    loops = [system.loop for system in over.systems]
+    loops = [system.loop for system in margins.band.systems]
     title = f"{scenario.title or scenario.name}: the open loop"
-    frequency.loop_shape(nominal.loop, nominal.margins, loops, title=title).savefig(picture)
+    frequency.loop_shape(margins.nominal.loop, margins.nominal.margins, loops, title=title).savefig(picture)
 
 
-def _document(
-    scenario: Scenario, nominal: "System", over: "Band", values: dict[str, float], target: float | None
-) -> JsonObject:
-    """Return the JSON document, in SI."""
-    content = {
-        "scenario": scenario.name,
-        "at": values | ({} if target is None else {"target": target}),
-        "period": nominal.loop.period,
-        "delay_in_the_loop": nominal.loop.delay,
-        "order": len(nominal.loop.transfer().A),
-        "margins": nominal.margins.record(),
-        "units": MARGIN_UNITS,
-        "over": {path: list(ends) for path, ends in _ranges(scenario, values).items()},
-        **over.record(),
-        "versions": provenance.versions(),
-        "files": {},
-    }
-    return documents.stamp("margins", content)
-
-
-def _show(result: JsonObject, scenario: Scenario, nominal: "System", over: "Band") -> None:
+def _show(result: JsonObject, scenario: Scenario, margins: ScenarioMargins) -> None:
     """Show a table of the margins, with the worst value and its place."""
-    worst = over.worst()
-    table = Table("margin", "here", *([f"worst of {len(over.systems)}", "where"] if worst else []))
+    worst = margins.band.worst()
+    table = Table("margin", "here", *([f"worst of {len(margins.band.systems)}", "where"] if worst else []))
     for name, words in MARGIN_NAMES.items():
-        row = [_format_margin(name, nominal)]
+        row = [_format_margin(name, margins.nominal)]
         if system := worst.get(name):
             row += [_format_margin(name, system), _format_place(system.values, scenario)]
         table.add_row(words, *row)
@@ -156,7 +121,7 @@ def _show(result: JsonObject, scenario: Scenario, nominal: "System", over: "Band
     show.show_files(result)
 
 
-def _format_margin(name: str, system: "System") -> str:
+def _format_margin(name: str, system: System) -> str:
     value = system.margins.numbers()[name]
     if math.isnan(value):
         return "undecided" if name == "delay" and system.margins.stable else "none"
@@ -172,11 +137,11 @@ def _format_place(values: dict[str, float], scenario: Scenario) -> str:
     return ", ".join(words)
 
 
-def _judge(scenario: Scenario, nominal: "System", over: "Band") -> None:
+def _judge(scenario: Scenario, margins: ScenarioMargins) -> None:
     """Raise typer.Exit for a loop that is unstable, here or within the ranges."""
-    if not nominal.margins.stable:
+    if not margins.nominal.margins.stable:
         console.conclude(f"{scenario.name}: the closed loop is not stable: no margins")
-    if over.unstable:
-        first = _format_place(over.unstable[0].values, scenario)
-        count = f"{len(over.unstable)} of {len(over.systems)} systems"
+    if unstable := margins.band.unstable:
+        first = _format_place(unstable[0].values, scenario)
+        count = f"{len(unstable)} of {len(margins.band.systems)} systems"
         console.conclude(f"{scenario.name}: not stable in {count} of the ranges, as at {first}")

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from diffabs.cli import console, show_proofs, targets
-from diffabs.cli import show as views
+from diffabs.cli import console, show, show_proofs, targets
 from diffabs.cli.options import read_assignments
 from diffabs.core.types import JsonObject
 from diffabs.host.separated import read_decimal
 from diffabs.host.values import ScenarioError, format_given
+from diffabs.scenario.model import result_document
 from diffabs.scenario.parameter_paths import BoxSide, read_box
 from diffabs.scenario.scenario import Scenario
 
@@ -82,8 +82,8 @@ def prove(
                     )  # fmt: skip
                 except (NoRule, NoCompiler) as error:
                     raise ScenarioError(str(error)) from None
-                result = console.document("prove", setup, proof.record(), "numpy")
-                show_result = functools.partial(_show, result, setup, as_json)
+                result = result_document("prove", setup, proof.record(), "numpy")
+                show_result = functools.partial(show.show_result, as_json, show_proofs.show_box_proof, result, setup)
                 if file:
                     with console.show_before_errors(show_result):
                         proof.save(file, setup)
@@ -95,10 +95,6 @@ def prove(
         show_result()
         if proof.verdict != "proved":
             console.conclude(f"{setup.name}: {proof.verdict}: {result['reason']}")
-
-
-def _show(result: JsonObject, scenario: Scenario, as_json: bool) -> None:
-    views.as_json(result) if as_json else show_proofs.show_box_proof(result, scenario)
 
 
 def _read_sides(options: Sequence[str], scenario: Scenario) -> list[BoxSide]:

@@ -4,19 +4,15 @@ It needs the extra `sweep`, which is imported only when the command runs.
 """
 
 import dataclasses
-import math
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from diffabs.cli import console, progress, show, show_samples
 from diffabs.cli import engine as engines
-from diffabs.core.pytree import ParameterSpec
-from diffabs.host.values import ScenarioError, read_number, unknown_name_error
+from diffabs.host.values import ScenarioError
 from diffabs.scenario import section_sweep
-from diffabs.scenario.registry import unit_of
-from diffabs.scenario.scenario import Scenario
-from diffabs.scenario.toml import parse_value
+from diffabs.scenario.model import result_document
 
 if TYPE_CHECKING:
     from diffabs.uncertainty.reliability.subset_simulation import RareEvent, SubsetProgress
@@ -42,45 +38,34 @@ def rare(
     Parameters vary as [sweep.over] says. Probabilities below 1e-7 are feasible."""
     with console.end_on_errors():
         console.need_extra("sweep")
-        from diffabs.uncertainty.reliability.failure import describe_failures, find_metric_objection
+        from diffabs.uncertainty.reliability.failure import choose_metric_engine, describe_failures
 
         setup = console.load_scenario(scenario, console.add_option_overrides(changes, "sweep", seed=seed))
         show_samples.say_unused_seed(setup)
-        metric, bound = _read_failure(failure, setup)
+        metric, bound = section_sweep.read_failure(failure, setup)
         if samples < 20 or samples % 10:
             console.fail(f"--samples {samples} is not a multiple of 10 in [20, inf)")
         study = section_sweep.build_study(setup)
+        study = dataclasses.replace(study, engine=engine)
         try:
-            usable = engines.choose_engine(engine, lambda: find_metric_objection(study, metric))
-            study = dataclasses.replace(study, engine=usable)
+            study, why = console.run_with_progress(
+                lambda: choose_metric_engine(study, metric), engines.COMPILING_KERNEL
+            )
         except ValueError as error:
             raise ScenarioError(str(error)) from None
+        if why:
+            console.say(engines.XLA_NOTE.format(why))
         event = _estimate(study, metric, bound, samples, gradients)
         values = describe_failures(event, study, metric, bound)
-        result = console.document("rare", setup, values, "numpy", "scipy")
-        show.as_json(result) if as_json else show_samples.show_rare_event(result, setup)
-
-
-def _read_failure(text: str, scenario: Scenario) -> tuple[str, float]:
-    """Return a metric and its bound in SI. Raises ScenarioError."""
-    metric, equals, bound = text.partition("=")
-    if metric not in scenario.objectives:
-        raise unknown_name_error(f"{metric} is not a metric of this scenario", metric, scenario.objectives)
-    if equals:
-        spec = ParameterSpec(unit_of(scenario.objectives[metric], scenario.loop.plant))
-        value = read_number(parse_value(bound.strip()), spec, metric)
-        if not math.isfinite(value):
-            raise ScenarioError(f"{metric} = {value:g} is outside {spec.interval()}")
-        return metric, value
-    if metric not in scenario.sweep.failures:
-        raise ScenarioError(f"{metric} has no bound in [sweep.failures]: say {metric}=BOUND")
-    return metric, scenario.sweep.failures[metric]
+        result = result_document("rare", setup, values, "numpy", "scipy")
+        show.show_result(as_json, show_samples.show_rare_event, result, setup)
 
 
 def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients: bool) -> "RareEvent":
     """Return the probability. Raises ScenarioError for a wrong task, typer.Exit if too many runs diverge."""
     from diffabs.uncertainty.reliability.failure import failure_probability
     from diffabs.uncertainty.reliability.importance_sampling import DivergenceError
+    from diffabs.uncertainty.reliability.subset_simulation import describe_levels
 
     levels: list[SubsetProgress] = []
 
@@ -100,10 +85,7 @@ def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients
     except KeyboardInterrupt:
         if not levels:
             raise
-        probability, last = math.prod(level.share for level in levels), levels[-1]
-        reached = f"{metric} {'>' if last.strict else '>='} {last.threshold:.4g}"
-        estimate = f"{reached} has a probability of about {probability:.2g}"
-        console.say(f"interrupted: {estimate}, by {last.evaluations:,} runs")
+        console.say(f"interrupted: {metric} {describe_levels(levels)}")
         raise typer.Exit(console.INTERRUPTED) from None
     except DivergenceError as error:
         console.fail(str(error), console.FAILED)

@@ -2,9 +2,8 @@
 
 import math
 import pathlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 
-import numpy as np
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Group
@@ -12,13 +11,13 @@ from rich.table import Table
 
 from diffabs.cli.console import say
 from diffabs.cli.tables import open_console, show_titled_table
-from diffabs.core.bijectors import reached_bound
 from diffabs.core.summary import format_metric, round_for_table
-from diffabs.core.types import JsonObject, Params
+from diffabs.core.types import JsonObject
 from diffabs.host import documents
 from diffabs.papers.digest import Digest
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
+from diffabs.scenario.tuning import format_shortfall, numbers_at_bounds
 
 PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
 COSTS = {
@@ -37,13 +36,20 @@ def as_json(value: object) -> None:
     typer.echo(documents.format_document(value))
 
 
+def show_result(json_wanted: bool, view: Callable[..., None], result: JsonObject, *more: object) -> None:
+    """Print the JSON document of a result, or show it by its view, which also gets `more`."""
+    as_json(result) if json_wanted else view(result, *more)
+
+
 def show_run(result: JsonObject, scenario: Scenario) -> None:
-    """Show metrics with their units, and the files written."""
+    """Show metrics with their units, the files written, and the accuracy if it was checked."""
     table = Table("metric", "value", "unit")
     for name, value in result["metrics"].items():
         table.add_row(name, format_metric(value), unit_of(scenario.objectives[name], scenario.loop.plant))
     show_titled_table(scenario.title or scenario.name, table)
     show_files(result)
+    if "accuracy" in result:
+        show_accuracy(result["accuracy"])
 
 
 def show_accuracy(accuracy: JsonObject) -> None:
@@ -174,14 +180,6 @@ def show_tuning(result: JsonObject, scenario: Scenario) -> None:
     show_files(result)
 
 
-def format_shortfall(row: JsonObject) -> str:
-    """Return the amount by which a constraint is not met, in words."""
-    if row["missed"] is None:
-        return "not known"
-    part = f" ({100 * row['missed'] / abs(row['bound']):.2g} %)" if row["bound"] else ""
-    return f"by {row['missed']:.3g}{part}"
-
-
 def show_identification(result: JsonObject) -> None:
     """Show values with standard deviations, residuals and strong correlations."""
     values = Table("parameter", "before", "identified", "standard deviation", "unit")
@@ -212,16 +210,3 @@ def format_brief(value: object) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(format_brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
     return round_for_table(value) if isinstance(value, float) else str(value)
-
-
-def numbers_at_bounds(free: Params) -> Iterator[str]:
-    """Yield each tuned number at a bound of its range, with the bound.
-
-    A number is at a bound if it is in the outer hundredth of its range (`reached_bound`).
-    """
-    for path, row in free.items():
-        after, low, high = np.broadcast_arrays(*(np.asarray(row[key], float) for key in ("after", "low", "high")))
-        for at in np.ndindex(after.shape):
-            name = ".".join([path, *map(str, at)])
-            if side := reached_bound(*(float(column[at]) for column in (low, high, after))):
-                yield f"{name} ({side}, {(low if side == 'lower' else high)[at]:g})"

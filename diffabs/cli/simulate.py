@@ -1,6 +1,7 @@
 """The command `simulate`: one run of a scenario."""
 
 import contextlib
+import functools
 import pathlib
 from typing import Annotated
 
@@ -8,13 +9,12 @@ import typer
 
 from diffabs.cli import console, show, targets
 from diffabs.core.pytree import parameters
-from diffabs.core.types import JsonObject, Key
+from diffabs.core.types import JsonObject
 from diffabs.engine.convert import write_csv
 from diffabs.engine.matlab import write_mat
 from diffabs.engine.types import Run
 from diffabs.host import documents, provenance
-from diffabs.host.values import ScenarioError
-from diffabs.loop.checking import check_run_accuracy, describe_check
+from diffabs.loop.checking import describe_check
 from diffabs.scenario.samples import load_sample
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.simulation import simulate as run_scenario
@@ -74,9 +74,7 @@ def simulate(
             simulation = console.run_with_progress(
                 lambda: run_scenario(setup, key, max_rows=max_rows), f"simulating {setup.name}"
             )
-            accuracy = (
-                console.run_with_progress(lambda: _check_accuracy(setup, key), "shortening the step") if check else None
-            )
+            accuracy = console.run_with_progress(simulation.accuracy, "shortening the step") if check else None
             lines = describe_check(accuracy) if accuracy else simulation.loose_metrics()
             result = documents.stamp("simulate", simulation.record())
             result |= {"versions": provenance.versions(), "files": {}}
@@ -85,7 +83,8 @@ def simulate(
                 result["sample"] = {"sweep": str(from_sweep), "seed": setup.sweep.seed, "number": sample}
             if accuracy:
                 result["accuracy"] = accuracy
-            with console.show_before_errors(lambda: _show(result, setup, as_json)):
+            show_result = functools.partial(show.show_result, as_json, show.show_run, result, setup)
+            with console.show_before_errors(show_result):
                 if csv_file:
                     write_csv(csv_file, simulation.run, setup.loop.plant)
                 if mat_file:
@@ -94,16 +93,10 @@ def simulate(
                 if picture:
                     console.run_with_progress(lambda: _draw(setup, simulation.run, picture), "drawing")
         result["files"] |= {name: str(path) for name, path in (("csv", csv), ("mat", mat), ("plot", plot)) if path}
-        _show(result, setup, as_json)
+        show_result()
         for line in lines:
             console.say(f"warning: {line}")
         _judge(setup, result, simulation.slide())
-
-
-def _show(result: JsonObject, scenario: Scenario, as_json: bool) -> None:
-    show.as_json(result) if as_json else show.show_run(result, scenario)
-    if "accuracy" in result and not as_json:
-        show.show_accuracy(result["accuracy"])
 
 
 def _judge(scenario: Scenario, result: JsonObject, slides: str) -> None:
@@ -115,13 +108,6 @@ def _judge(scenario: Scenario, result: JsonObject, slides: str) -> None:
         console.say(f"warning: {slides}")
     for warning in result["warnings"]:
         console.say(f"warning: {warning}")
-
-
-def _check_accuracy(scenario: Scenario, key: Key) -> JsonObject:
-    try:
-        return check_run_accuracy(scenario.loop, scenario.solver, scenario.objectives, key)
-    except ValueError as error:
-        raise ScenarioError(str(error)) from None
 
 
 def _draw(scenario: Scenario, run: Run, picture: pathlib.Path) -> None:

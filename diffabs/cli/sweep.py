@@ -6,6 +6,7 @@ runs.
 
 import contextlib
 import dataclasses
+import functools
 import os
 import pathlib
 import sys
@@ -19,7 +20,7 @@ from diffabs.cli import console, progress, report, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.core.types import JsonObject, PyTree
 from diffabs.engine.drive.engine import EngineError
-from diffabs.host import documents, files
+from diffabs.host import documents, files, provenance
 from diffabs.host.values import unknown_name_error
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import Scenario, dump
@@ -86,11 +87,12 @@ def sweep(
                 raise KeyboardInterrupt
             check = setup.sweep.check
             result = console.run_with_progress(lambda: _result(results, study, out, check), "computing statistics")
-            with console.show_before_errors(lambda: _show(result, setup, as_json)):
+            show_result = functools.partial(show.show_result, as_json, show_samples.show_sweep, result, setup)
+            with console.show_before_errors(show_result):
                 console.run_with_progress(
                     lambda: _write_files(result, results, study, out, numbers, figures), "writing the results"
                 )
-        _show(result, setup, as_json)
+        show_result()
         from diffabs.uncertainty.sweep.checking import accuracy_warnings
 
         for line in accuracy_warnings(result["accuracy"]) if result["accuracy"] else ():
@@ -98,10 +100,6 @@ def sweep(
         if result["refused"]["count"] == result["samples"]:
             why = next(iter(result["refused"]["reasons"]))
             console.fail(f"{setup.name}: no sample could be run: {why}", console.FAILED)
-
-
-def _show(result: JsonObject, scenario: Scenario, as_json: bool) -> None:
-    show.as_json(result) if as_json else show_samples.show_sweep(result, scenario)
 
 
 @contextlib.contextmanager
@@ -177,7 +175,7 @@ def _with_engine(study: "Study", engine: str, out: pathlib.Path, resume: bool, r
         engines.COMPILING_KERNEL,
     )
     if why:
-        console.say(f"note: runs are made by XLA: {why}")
+        console.say(engines.XLA_NOTE.format(why))
     if study.engine == "kernel" and (
         line := console.run_with_progress(lambda: find_study_objection(study), engines.COMPILING_KERNEL)
     ):
@@ -201,16 +199,9 @@ def _run(study: "Study", scenario: Scenario, out: pathlib.Path, resume: bool, on
     ending = console.InterruptibleEnd("the chunks in hand")
 
     def report_progress(at: "Told") -> None:
-        words, count = f"{at.samples:,} of {at.total:,}", len(at.damaged)
-        if at.here:
-            words += f": {at.rate:,.0f}/s, {at.failed:,} failed, {at.diverged:,} diverged"
-            words += f", {at.refused:,} refused" if at.refused else ""
-        else:
-            words += f", {progress.COMPILING}"
-            if count:
-                first = ", ".join(map(str, at.damaged[:8])) + (f" and {count - 8} more" if count > 8 else "")
-                console.say(f"damaged, computed again: chunk{'s' if count > 1 else ''} {first}")
-        far[0] = progress.WorkProgress(words, at.samples, at.total)
+        if at.damaged and not at.here:
+            console.say(at.describe_damage())
+        far[0] = progress.WorkProgress(at.describe_count(), at.samples, at.total)
 
     def run() -> "Results":
         from diffabs.uncertainty.sweep import sweep as run
@@ -229,7 +220,7 @@ def _result(results: "Results", study: "Study", out: pathlib.Path, check: int) -
     from diffabs.uncertainty.sweep.statistics.summary import summarise_checked_sweep
 
     values = {"out": str(out), **summarise_checked_sweep(results, study, check)}
-    result = documents.stamp("sweep", {**values, "made": console.describe_run(), "files": {}})
+    result = documents.stamp("sweep", {**values, "made": provenance.describe_command(), "files": {}})
     _write_summary(out, result)
     return result
 

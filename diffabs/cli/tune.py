@@ -4,23 +4,19 @@ It needs the extra `tune`, and for a proof the extra `design`. Modules that need
 runs.
 """
 
-import dataclasses
 import functools
 import pathlib
 from typing import TYPE_CHECKING, Annotated
 
-import jax
-import numpy as np
 import typer
 
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.cli import engine as engines
 from diffabs.core.types import JsonObject
-from diffabs.engine.run import rollout
-from diffabs.engine.types import Trajectory
+from diffabs.scenario.model import result_document
 from diffabs.scenario.proving import Proved, certify_result, without_certificate
 from diffabs.scenario.scenario import Scenario, dump
-from diffabs.scenario.tuning import Work, build_work, describe_tuning
+from diffabs.scenario.tuning import Work, build_tuning, build_work, describe_tuning, format_shortfall, with_unproved
 
 if TYPE_CHECKING:
     from diffabs.tune import Tuned, TuningProgress
@@ -80,7 +76,7 @@ def _leave_if_interrupted(result: JsonObject) -> None:
 
 
 def _unmet_constraints(result: JsonObject) -> str:
-    return ", ".join(f"{row['name']} {show.format_shortfall(row)}" for row in result["constraints"] if not row["met"])
+    return ", ".join(f"{row['name']} {format_shortfall(row)}" for row in result["constraints"] if not row["met"])
 
 
 def _show(result: JsonObject, sentence: str, scenario: Scenario, as_json: bool) -> None:
@@ -100,13 +96,13 @@ def _tune_and_document(work: Work, engine: str) -> tuple["Tuned", JsonObject, st
         result = console.run_with_progress(lambda: _document(work, tuned, proved), "comparing before and after")
     except KeyboardInterrupt:
         interrupted, proved = True, without_certificate("interrupted")
-        result = _without_proof(work, _document(work._replace(task=None), tuned, proved))
+        result = with_unproved(work, _document(work._replace(task=None), tuned, proved))
     return tuned, {**result, "interrupted": interrupted}, proved.sentence
 
 
 def _document(work: Work, tuned: "Tuned", proved: Proved) -> JsonObject:
     packages = ("optax", "scipy", *(("cvxpy", "clarabel") if proved.certified else ()))
-    return console.document("tune", work.scenario, describe_tuning(work, tuned, proved), *packages)
+    return result_document("tune", work.scenario, describe_tuning(work, tuned, proved), *packages)
 
 
 def _draw_unless_interrupted(work: Work, tuned: "Tuned", picture: pathlib.Path, interrupted: bool) -> JsonObject:
@@ -119,19 +115,6 @@ def _draw_unless_interrupted(work: Work, tuned: "Tuned", picture: pathlib.Path, 
     return {"interrupted": interrupted}
 
 
-def _without_proof(work: Work, result: JsonObject) -> JsonObject:
-    """Return the document with the unchecked constraints added, as not met."""
-    names = [row["name"] for row in result["constraints"]]
-    goal = work.scenario.tune
-    bounds = {"certified decay": goal.decay, "damping": goal.damping}
-    unseen = [
-        {"name": name, "bound": bounds[name], "before": None, "after": None, "met": False, "missed": None}
-        for name in work.constraints
-        if name not in names
-    ]
-    return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
-
-
 def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
     """Return the tuning, and True if Ctrl-C ended it. Raises typer.Exit if no start can be used."""
     from diffabs import tune
@@ -142,17 +125,7 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
     method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
     max_iterations = None if work.constraints else goal.iterations  # with constraints the number of rounds is unknown
 
-    problem = tune.build_problem(
-        work.scenario.loop,
-        free=goal.free,
-        objective=goal.objective,
-        over=work.batch,
-        solver=work.scenario.solver,
-        measured=work.scenario.objectives,
-        aggregate=goal.read_aggregate(),
-        constraints=list(work.constraints.values()),
-        engine=engine,
-    )
+    problem = build_tuning(work, engine)
     _, reason = console.run_with_progress(problem.find_engine, engines.COMPILING_KERNEL)
     if reason:
         console.say(engines.XLA_NOTE.format(reason))
@@ -181,19 +154,6 @@ def _format_progress(history: "list[TuningProgress]", max_iterations: int | None
 
 
 def _draw(work: Work, tuned: "Tuned", path: pathlib.Path) -> None:
-    """Draw the history, and the run that is worst after the tuning, before and after it."""
-    from diffabs.output.plot.tuning import draw_tuning
+    from diffabs.output.plot.tuning import draw_worst_run
 
-    scenario, metrics = work.scenario, tuned.metrics[1]
-    worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in scenario.tune.objective.items())))
-    solver = dataclasses.replace(scenario.solver, every=min(scenario.solver.every, scenario.solver.steps))
-
-    def roll_out(loop: object) -> Trajectory:
-        run = jax.device_get(rollout(work.batch.lane(loop, worst), solver, key=scenario.key()))
-        assert run.trajectory is not None
-        return run.trajectory
-
-    runs = {"before": roll_out(scenario.loop), "after": roll_out(tuned.loop)}
-    where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
-    title = scenario.title or scenario.name
-    draw_tuning(tuned.history, runs, title=title, lane=where, unit=scenario.loop.plant.control_unit).savefig(path)
+    draw_worst_run(work, tuned).savefig(path)

@@ -16,6 +16,7 @@ import typer.core
 from diffabs.cli import console, targets
 from diffabs.cli import engine as engines
 from diffabs.core.types import PyTree, Scalar
+from diffabs.host import provenance
 from diffabs.scenario.registry import register_parts
 
 # The base class of all usage errors. It is taken from the Click that this Typer uses, which may be Typer's own copy.
@@ -51,7 +52,7 @@ class Group(typer.core.TyperGroup):
         `args` and `more` are those of Click.
         """
         words = more.get("args", args[0] if args else None)
-        console.note_command(sys.argv[1:] if words is None else words)
+        provenance.begin_command(sys.argv[1:] if words is None else words)
         console.escape_unencodable_output()
         try:
             with console.end_on_errors():

@@ -11,9 +11,15 @@ import platform
 import shlex
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 
 import jax
+
+from diffabs.host import stopwatch
+
+_words: tuple[str, ...] = ()  # the words after `diffabs`
+_begun = time.monotonic()
 
 
 def versions(*packages: str) -> dict[str, str]:
@@ -52,6 +58,19 @@ def describe_making(words: Sequence[str]) -> dict[str, str | int]:
     machine = {"machine": platform.machine(), "system": platform.system(), "processors": os.cpu_count() or 1}
     command = shlex.join(["diffabs", *map(str, words)])
     return {"command": command, "date": now.isoformat(), **machine, "backend": jax.default_backend(), **source_commit()}
+
+
+def begin_command(words: Sequence[str]) -> None:
+    """Store the words after `diffabs` of the command that begins, and start its clock."""
+    global _words, _begun
+    _words, _begun = tuple(words), time.monotonic()
+    stopwatch.count_compilations()
+
+
+def describe_command() -> dict[str, str | float]:
+    """Return `describe_making` of the command, its time [s] so far, and the part of it that JAX compiled."""
+    seconds, compiling = time.monotonic() - _begun, stopwatch.compile_time_since(_begun)
+    return {**describe_making(_words), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
 
 
 def source_commit() -> dict[str, str]:

@@ -14,13 +14,13 @@ from mutants import killed_by
 from project import ROOT
 from seams import replace_seam
 
-from diffabs.cli import certificates
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Scalar
 from diffabs.linear.linearization import StateSpace
 from diffabs.robust.design import Certificate, DesignError, findings
 from diffabs.robust.design.frozen import analyse_frozen_loops
 from diffabs.robust.design.sdp import solver
+from diffabs.scenario import proving
 from diffabs.scenario.scenario import load
 
 CHECKER = ROOT / "tests" / "support" / "check_certificate.py"
@@ -291,13 +291,13 @@ def greatest_deceleration(speed):
 def test_the_relative_fall_counts_air_drag_at_every_speed(tmp_path):
     path = tmp_path / "vehicle.toml"
     path.write_text(VEHICLE)
-    task = certificates.read_proof_task(load(path))
+    task = proving.build_proof_task(load(path))
     fall = 1.01e-3 * greatest_deceleration(55.0)
     np.testing.assert_allclose(task.over["fall"][1], fall / (55.0 - fall), rtol=1e-4)
     assert task.gain.tolist() == [-50000.0, -9000.0, 0.0]  # at the controller's reference speed
     path.write_text(VEHICLE.replace("[144.0, 198.0]", "[0.01, 198.0]"))
     with pytest.raises(ValueError, match=r"speed = 0.00277778 m/s ends in a period of 0.001 s"):
-        certificates.read_proof_task(load(path))
+        proving.build_proof_task(load(path))
 
 
 @killed_by("robust.design.findings", "speeds_of_box(task.over, low)).max()", "speeds_of_box(task.over, low)).min()")
@@ -306,10 +306,10 @@ def test_the_greatest_fall_is_at_one_end_of_the_speeds(tmp_path, monkeypatch):
     path = tmp_path / "vehicle.toml"
     path.write_text(VEHICLE.replace("[144.0, 198.0]", "[18.0, 198.0]"))
     fall = 1.01e-3 * greatest_deceleration(5.0)
-    np.testing.assert_allclose(certificates.read_proof_task(load(path)).over["fall"][1], fall / (5.0 - fall), rtol=1e-4)
+    np.testing.assert_allclose(proving.build_proof_task(load(path)).over["fall"][1], fall / (5.0 - fall), rtol=1e-4)
     continuous = VEHICLE.replace('type = "sampled"\nperiod = 1e-3\n[controller.controller]\n', "").replace(*ONE_GAIN)
     path.write_text(continuous)
-    task, proof = certificates.read_proof_task(load(path)), types.SimpleNamespace(quadratically_stable=None)
+    task, proof = proving.build_proof_task(load(path)), types.SimpleNamespace(quadratically_stable=None)
     replace_seam(monkeypatch, "certify", lambda gain, cells, spec: types.SimpleNamespace(stable=True))
     found = findings.find_further(task, proof)
     np.testing.assert_allclose(found.fall, 1.01 * greatest_deceleration(55.0), rtol=1e-4)

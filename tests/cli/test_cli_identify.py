@@ -320,7 +320,7 @@ def test_a_limit_that_a_simulation_lacks_is_not_measured(csv):
         read_measurements(csv("t [s],psi [rad]", "0,inf"), units)
 
 
-@killed_by("cli.identify", "        if name in readings.infinite:", "        if False:")
+@killed_by("scenario.measurements", "            if name in self.infinite:", "            if False:")
 @killed_by("cli.identify", "if readings.infinite and not names:", "if False:")
 def test_a_column_that_is_left_out_is_named(csv, capsys):
     path, units = csv("t [s],psi [rad],current_max [A]", "0,0.1,inf", "0.1,0.2,inf"), {"psi": "rad", "current_max": "A"}

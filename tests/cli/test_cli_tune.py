@@ -23,12 +23,12 @@ from seams import replace_seam
 from small_scenarios import TUNE as SMALL
 
 import diffabs.tune as library
-from diffabs.cli import certificates, console, progress
+from diffabs.cli import console, progress
 from diffabs.cli import tune as commands_tune
 from diffabs.core.pytree import parameters, replace
 from diffabs.engine.run import measure
 from diffabs.robust.design.sdp import solver
-from diffabs.scenario import tuning
+from diffabs.scenario import proving, tuning
 from diffabs.scenario.proving import Proved
 from diffabs.scenario.scenario import load
 from diffabs.tune import DerivativeMode, Reason, StartError, Tuned
@@ -62,7 +62,7 @@ pytestmark = pytest.mark.usefixtures("any_step_is_stable")  # it has tests of it
 def quick():
     """No seconds for figures, which have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(sys.modules, "diffabs.output.plot.tuning", types.SimpleNamespace(draw_tuning=drawn))
+        patch.setattr("diffabs.output.plot.tuning.draw_tuning", drawn)
         yield
 
 
@@ -395,7 +395,7 @@ def test_what_the_packaged_cure_says_is_met_is_met(tmp_path, changes):
         assert row["after"] <= row["bound"] if row["name"] == "overshoot" else row["after"] >= row["bound"]
         assert row["missed"] == 0.0
     after = load(tmp_path / "c.toml")
-    asked = certificates.read_proof_task(after)
+    asked = proving.build_proof_task(after)
     z = np.linalg.eigvals(asked.polytope.closed_loop(asked.gain)).astype(complex)
     poles = np.log(z[np.abs(z) > 1e-9]) / asked.polytope.period  # the rest decays at once
     assert (-poles.real / np.abs(poles)).min() >= after.tune.damping
@@ -483,7 +483,7 @@ def test_interrupted_while_it_certifies_it_shows_what_was_found(small, invented,
     assert (tmp_path / "out.toml").exists()
 
 
-@killed_by("cli.tune", '"met": False, "missed": None}', '"met": False}')
+@killed_by("scenario.tuning", '"met": False, "missed": None}', '"met": False}')
 def test_interrupted_while_it_certifies_what_is_asked_for(small, invented, tmp_path, monkeypatch):
     def interrupted(_):
         raise KeyboardInterrupt

@@ -12,7 +12,7 @@ from seams import replace_seam
 
 from diffabs.cli import console, progress
 from diffabs.cli.progress import WorkProgress, WorkTiming
-from diffabs.host import stopwatch
+from diffabs.host import provenance, stopwatch
 
 
 @pytest.fixture
@@ -107,12 +107,12 @@ def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
     assert re.fullmatch(r"working ... somewhere; \d+ s(, \d+ s of it compiling)?\n", said), said
 
 
-@killed_by("cli.console", '"of it compiling": round(compiling, 1)', '"of it compiling": 0.0')
+@killed_by("host.provenance", '"of it compiling": round(compiling, 1)', '"of it compiling": 0.0')
 def test_documents_say_how_long_they_took():
-    console.note_command(["list", "roads"])
+    provenance.begin_command(["list", "roads"])
     with stopwatch.count_as_compiling():
         time.sleep(0.2)
-    made = console.describe_run()
+    made = provenance.describe_command()
     assert made["command"] == "diffabs list roads"
     assert 0.1 <= made["of it compiling"] <= made["seconds"] <= 300.0
 

@@ -91,7 +91,7 @@ REFUSALS = [
         ["parameter of the linear model, but not of this loop: remove it from [design.over]"],
     ),
     # export
-    ("export slip-cured --to cc", 2, ["error: --to: 'cc' is not one of 'c', 'st', 'table', 'fmu'"]),
+    ("export slip-cured --to cc", 2, ["error: --to: 'cc' is not one of 'c', 'st', 'fmu'"]),
     ("export slip-cured --given slip", 2, ["error: --given: 'slip' is not one of 'target'"]),
     # compile
     ("compile slip-lmi --show jpv", 2, ["--show jpv is unknown; did you mean jvp?"]),
@@ -316,7 +316,7 @@ REFUSALS = [
 
 
 @killed_by(
-    "cli.certificates", "    if len(values) != len(states):", "    if False:", case="certify slip-lmi --gain=1,2,3"
+    "scenario.proving", "    if len(values) != len(states):", "    if False:", case="certify slip-lmi --gain=1,2,3"
 )
 @killed_by("scenario.proving", ", reduced.model.period)", ")", case="certify slip-cured --set design.damping=")
 @killed_by(
@@ -338,7 +338,7 @@ REFUSALS = [
     "if False:",
     case="tune tune.toml --set tune.samples=9 --se",
 )
-@killed_by("cli.rare", "if not math.isfinite(value):", "if False:", case="rare rare.toml overshoot=nan")
+@killed_by("scenario.section_sweep", "if not math.isfinite(value):", "if False:", case="rare rare.toml overshoot=nan")
 @pytest.mark.usefixtures("any_step_is_stable")
 @pytest.mark.parametrize(("command", "status", "needed"), REFUSALS, ids=[readable_id(row[0]) for row in REFUSALS])
 def test_a_refusal_is_one_line_and_leaves_nothing(command, status, needed, tmp_path, monkeypatch):

@@ -53,7 +53,7 @@ def test_a_tuning_that_cannot_be_written_is_shown(small, tmp_path, monkeypatch):
     assert not (tmp_path / "tuned.toml").exists()
 
 
-@killed_by("cli.simulate", "with console.show_before_errors(lambda: _show(result, setup, as_json)):", "if True:")
+@killed_by("cli.simulate", "with console.show_before_errors(show_result):", "if True:")
 def test_a_run_that_cannot_be_drawn_is_shown(file, tmp_path, monkeypatch):
     monkeypatch.setattr(simulate, "_draw", fill_disk)
     content = shown("simulate", file(TUNE), "--plot", tmp_path / "run.png")

@@ -12,10 +12,10 @@ from mutants import killed_by
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, references, stops
-from diffabs.cli.show import numbers_at_bounds
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import param, pytree
 from diffabs.parts.objectives import SettlingTime, at_limits
+from diffabs.scenario.tuning import numbers_at_bounds
 
 
 class Position(NamedTuple):

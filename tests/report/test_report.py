@@ -462,7 +462,7 @@ def test_a_metric_that_a_half_step_turns_is_in_the_report(tmp_path):
 
 
 @killed_by("cli.sweep", "    _write_summary(out, result)\n    return result", "    return result")
-@killed_by("cli.sweep", "with console.show_before_errors(lambda: _show(result, setup, as_json)):", "if True:")
+@killed_by("cli.sweep", "with console.show_before_errors(show_result):", "if True:")
 @pytest.mark.slow
 def test_a_sweep_whose_figure_fails_keeps_its_summary(tmp_path, monkeypatch):
     def fail(figure, path):
