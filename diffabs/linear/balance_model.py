@@ -18,7 +18,7 @@ from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes, part, pytree
 from diffabs.core.rules import Rule
 from diffabs.linear.linearization import StateSpace, linearize
-from diffabs.linear.slip_model import Continuous, Sampling, SlipModel
+from diffabs.linear.slip_model import Continuous, Sampling
 from diffabs.linear.zero_order_hold import discretise_held_input
 from diffabs.parts.plants import ArmBalance, BalanceStart
 from diffabs.parts.plants.arm_balance import ArmState
@@ -35,7 +35,10 @@ class BalanceModel:
     sampling: Continuous | Sampling = part(default=Continuous)
     """`Continuous`, or `Sampling` with delay 0."""
 
-    period = SlipModel.period
+    @property
+    def period(self) -> float | None:
+        """Period of the samples [s]; None in continuous time."""
+        return float(self.sampling.period) if isinstance(self.sampling, Sampling) else None
 
     @property
     def states(self) -> tuple[str, ...]:
