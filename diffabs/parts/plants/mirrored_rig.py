@@ -16,7 +16,7 @@ from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import param, part, pytree
 from diffabs.core.types import Scalar
 from diffabs.parts.plants.audit import BrakeAudit
-from diffabs.parts.plants.wheel import GRAVITY, BrakedWheel, BrakeStart, forward_speed, halt_at_zero, slip_ratio
+from diffabs.parts.plants.wheel import GRAVITY, BrakedWheel, BrakeStart, forward_speed, halt_at_zero
 from diffabs.parts.roads import RIG
 
 
@@ -67,8 +67,7 @@ class MirroredRig(BrakedWheel):
     def output(self, state: RigState) -> BrakeOutput:
         """Return slip, rim speeds, deceleration mu g/c of the body's rim, and distance."""
         v, w = self.body_radius * state.body, self.wheel_radius * state.wheel
-        slip = slip_ratio(v, w, self.crawl_speed)
-        mu = self.road.friction(slip, v, state.distance)
+        slip, mu = self.slip_and_friction(v, w, state.distance)
         return BrakeOutput(slip, v, w, quotient(mu * GRAVITY, self.inertia_factor), state.distance)
 
     def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:

@@ -15,7 +15,7 @@ from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import param, part, pytree
 from diffabs.core.types import Scalar
 from diffabs.parts.plants.audit import BrakeAudit
-from diffabs.parts.plants.wheel import GRAVITY, BrakedWheel, BrakeStart, forward_speed, halt_at_zero, slip_ratio
+from diffabs.parts.plants.wheel import GRAVITY, BrakedWheel, BrakeStart, forward_speed, halt_at_zero
 from diffabs.parts.roads import SPLINE_B
 
 
@@ -60,8 +60,7 @@ class QuarterCar(BrakedWheel):
     def output(self, state: QuarterCarState) -> BrakeOutput:
         """Return slip [1], speeds of car and wheel rim [m/s], deceleration mu g [m/s^2], and distance [m]."""
         v, w = state.speed, self.radius * state.spin
-        slip = slip_ratio(v, w, self.crawl_speed)
-        mu = self.road.friction(slip, v, state.distance)
+        slip, mu = self.slip_and_friction(v, w, state.distance)
         return BrakeOutput(slip, v, w, mu * GRAVITY, state.distance)
 
     def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:

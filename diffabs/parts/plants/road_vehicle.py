@@ -17,7 +17,7 @@ from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import param, part, pytree
 from diffabs.core.types import Scalar
 from diffabs.parts.plants.quarter_car import QuarterCar, QuarterCarState
-from diffabs.parts.plants.wheel import GRAVITY, BrakedWheel, halt_at_zero, slip_ratio
+from diffabs.parts.plants.wheel import GRAVITY, BrakedWheel, halt_at_zero
 from diffabs.parts.roads import DRY_ASPHALT
 
 
@@ -50,7 +50,7 @@ class RoadVehicle(BrakedWheel):
         """Return dx/dt under the brake torque `control` [N m]."""
         del t
         y = self.output(state)
-        grip = self._grip(y.slip, y.speed, y.distance)
+        grip = self.wheel_load * self.road.friction(y.slip, y.speed, y.distance)
         spin = quotient(self.radius * grip - self.bearing * state.spin - control, self.inertia)
         return QuarterCarState(halt_at_zero(state.speed, -y.deceleration), halt_at_zero(state.spin, spin), y.speed)
 
@@ -60,17 +60,14 @@ class RoadVehicle(BrakedWheel):
         The rolling resistance counts only while the car moves.
         """
         v, w = state.speed, self.radius * state.spin
-        slip = slip_ratio(v, w, self.crawl_speed)
+        slip, mu = self.slip_and_friction(v, w, state.distance)
         resistance = self.drag * v * v + self.rolling * self.mass * GRAVITY * jnp.where(jnp.greater(v, 0), 1.0, 0.0)
-        deceleration = quotient(self._grip(slip, v, state.distance) + resistance, self.mass)
+        deceleration = quotient(self.wheel_load * mu + resistance, self.mass)
         return BrakeOutput(slip, v, w, deceleration, state.distance)
 
     def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:
         """Return tau* = r Fz mu - B omega + (1 - slip) J a/r [N m] at the deceleration a, for a constant slip."""
         v = output.speed
-        grip = self._grip(target, v, output.distance)
+        grip = self.wheel_load * self.road.friction(target, v, output.distance)
         a = quotient(grip + self.drag * v * v, self.mass) + self.rolling * GRAVITY
         return self.radius * grip + (1 - target) * (self.inertia * a - self.bearing * v) / self.radius
-
-    def _grip(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
-        return self.wheel_load * self.road.friction(slip, speed, distance)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.numerics import larger, quotient
-from diffabs.core.protocols import BrakeOutput
+from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.parts.controllers import PID
@@ -54,13 +54,25 @@ def forward_speed(speed: Scalar) -> Scalar:
 
 
 class BrakedWheel:
-    """Base of plants with a braked wheel, whose field `crawl_speed` [m/s] is the least denominator of the slip."""
+    """Base of plants with a braked wheel on a `road`; `crawl_speed` [m/s] is the least denominator of the slip."""
 
     crawl_speed: Scalar
+    road: Road
 
     shows = BrakeOutput
     control_unit = "N m"
     frozen = FROZEN_OUTPUTS
+
+    def slip_and_friction(self, speed: Scalar, wheel_speed: Scalar, distance: Scalar) -> tuple[Scalar, Scalar]:
+        """Return the slip (v - w)/v [1] of a wheel, and the friction mu(slip) [1] of the road below it.
+
+        Args:
+            speed: Speed v of the vehicle [m/s].
+            wheel_speed: Speed w of the wheel's rim [m/s].
+            distance: Place on the road [m].
+        """
+        slip = slip_ratio(speed, wheel_speed, self.crawl_speed)
+        return slip, self.road.friction(slip, speed, distance)
 
     def usual_parts(self) -> dict[str, PyTree]:
         """Return the default parts of a loop around a brake: a PID that holds a fixed slip until standstill.
