@@ -413,7 +413,7 @@ def test_load_does_not_change_a_cars_deceleration():
 
 @pytest.mark.slow
 @killed_by("parts.plants.road_vehicle", "self.drag * v * v + self.rolling", "self.drag * v + self.rolling")
-@killed_by("parts.plants.road_vehicle", "return self.wheel_load * self.road", "return self.mass * GRAVITY * self.road")
+@killed_by("parts.plants.road_vehicle", "self.wheel_load * mu", "self.mass * GRAVITY * mu")
 def test_a_locked_road_vehicle_stops_in_closed_form():
     """v' = -(a + c v^2/m) with a = (Fz mu + f m g)/m: time and distance from 30 to 3 m/s."""
     ice = Tabulated(slip=(0.0, 0.1, 0.5, 1.0), mu=(0.0, 0.3, 0.3, 0.3))
