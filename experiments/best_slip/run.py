@@ -43,10 +43,10 @@ class Config:
     out: str = "out/experiments/best_slip"
 
 
-def judged(config: Config, one: Loop, batch: Batch, finer: int = 1) -> Metrics:
+def judged(config: Config, loop: Loop, batch: Batch, finer: int = 1) -> Metrics:
     """Metrics of every lane, with so many times shorter steps."""
     solver = FixedStep(step=config.fixed.step / finer, duration=config.fixed.longest)
-    done = jax.device_get(run_batch(one, batch, solver, MEASURED, engine="kernel"))
+    done = jax.device_get(run_batch(loop, batch, solver, MEASURED, engine="kernel"))
     return {**done.metrics, "stopped": done.stopped, "diverged": done.diverged}
 
 
@@ -82,9 +82,9 @@ def _falls(unseen: Lanes) -> np.ndarray:
     return values["plant.road.roads.1.D"] < values["plant.road.roads.0.D"]
 
 
-def halved(config: Config, one: Loop, batch: Batch, found: Metrics, shortest: np.ndarray) -> dict[str, Any]:
+def halved(config: Config, loop: Loop, batch: Batch, found: Metrics, shortest: np.ndarray) -> dict[str, Any]:
     """By how much the mean above the bound changes [%] if steps are half as long; lanes that end otherwise."""
-    again = judged(config, one, batch, finer=2)
+    again = judged(config, loop, batch, finer=2)
     both = good(found) & good(again)
     change = (again["stop_distance"] - found["stop_distance"])[both] / shortest[both]
     return {
@@ -94,28 +94,28 @@ def halved(config: Config, one: Loop, batch: Batch, found: Metrics, shortest: np
 
 
 def of_sensors(
-    config: Config, sensors: str, told: Callable[[str], None], carried: dict[str, Loop]
+    config: Config, sensors: str, report: Callable[[str], None], carried: dict[str, Loop]
 ) -> tuple[dict[str, Any], dict[str, Metrics], dict[str, Loop]]:
     """Tune, judge and check the rules for these sensors. Returns the results, the metrics of every lane, and the
     loops by rule."""
     fixed, found = config.fixed, {}
     for rule in config.rules[sensors]:
         found[rule] = tuned(config.search, fixed, sensors, rule, config.ranges)
-        told(f"{sensors}, {rule}: {found[rule].tuned.objective[1]:.5f}")
+        report(f"{sensors}, {rule}: {found[rule].tuned.objective[1]:.5f}")
     own = carried | {rule: one.loop for rule, one in found.items()}
     unseen = lanes(fixed, fixed.roads.held_out, fixed.roads.seed + 1)
     shortest = unseen.bound.distance
     those = contenders(config, sensors, unseen, own)
     results = {name: judged(config, *one) for name, one in those.items()}
-    told(f"{sensors}: judged")
+    report(f"{sensors}: judged")
     named = {n: (f"tuned, {n}" if n in found else f"tuned for {EXACT}, {n}") if n in own else n for n in results}
     checks = {named[name]: halved(config, *those[name], results[name], shortest) for name in (PAPER, *own)}
-    told(f"{sensors}: halved")
+    report(f"{sensors}: halved")
     slopes = {
         rule: against_differences(config.search, fixed, sensors, rule, config.ranges, one.loop)
         for rule, one in found.items()
     }
-    told(f"{sensors}: differences")
+    report(f"{sensors}: differences")
     said = {
         "table": [{"rule": named[n], **line(fixed, one, results[PAPER], shortest)} for n, one in results.items()],
         "by road": [by_road(named[name], one, unseen) for name, one in results.items()],

@@ -201,11 +201,11 @@ def contenders(config: Config, found: Loop, lmi: tuple[float, float]) -> dict[st
     }
 
 
-def judged(config: Config, one: Loop, system: Polytope, batch: Batch) -> tuple[dict[str, Any], Certificate]:
+def judged(config: Config, loop: Loop, system: Polytope, batch: Batch) -> tuple[dict[str, Any], Certificate]:
     """Return the worst metrics of the lanes that do not diverge, and the certificate of the gain."""
     solver = FixedStep(step=config.step, duration=config.duration)
-    runs = jax.device_get(jax.jit(lambda one: run_batch(one, batch, solver, BRAKING))(one))
-    proof = certify(feedback_gain(one, system.states), system, fastest=True)
+    runs = jax.device_get(jax.jit(lambda loop: run_batch(loop, batch, solver, BRAKING))(loop))
+    proof = certify(feedback_gain(loop, system.states), system, fastest=True)
     worst = {name: float(np.max(kept(values, ~runs.diverged))) for name, values in runs.metrics.items()}
     row = {
         "overshoot [%]": 100 * worst["overshoot"],
@@ -227,11 +227,11 @@ def weak(config: Config, those: dict[str, tuple[Loop, str]]) -> list[dict[str, A
     return [{"controller": n, **weak_spots(one, config.box, solver, config.seeds)} for n, (one, _) in those.items()]
 
 
-def asked(config: Config, one: Loop) -> dict[str, tuple[float, float]]:
+def asked(config: Config, loop: Loop) -> dict[str, tuple[float, float]]:
     """Return least and greatest torque that the controller commands [N m]; inside the limits the linear model holds."""
     solver = FixedStep(step=config.step, duration=config.longer)
     outside = dataclasses.replace(config.box, speeds=(config.drawn[-1][1],))
-    return {"in the box": torques(one, config.box, solver), "from 70 km/h": torques(one, outside, solver)}
+    return {"in the box": torques(loop, config.box, solver), "from 70 km/h": torques(loop, outside, solver)}
 
 
 def summary(config: Config, found: Tuned, proof: Certificate) -> dict[str, Any]:

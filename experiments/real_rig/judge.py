@@ -61,12 +61,12 @@ class Judging:
     engine: str = "auto"
 
 
-def runs(one: Loop, points: dict[str, np.ndarray], config: Judging, seed: int) -> dict[str, np.ndarray]:
+def runs(loop: Loop, points: dict[str, np.ndarray], config: Judging, seed: int) -> dict[str, np.ndarray]:
     """Metrics at points of a box, each with a noise of its own, and whether the run stopped. One that diverges counts
     as locked."""
     lanes = batch(columns(points), seed)
     places = np.arange(config.block * -(-lanes.size // config.block)).clip(max=lanes.size - 1)
-    blocks = [_block(one, lanes, at, config) for at in places.reshape(-1, config.block)]
+    blocks = [_block(loop, lanes, at, config) for at in places.reshape(-1, config.block)]
     found: Any = jax.tree.map(lambda *parts: np.concatenate(parts)[: lanes.size], *blocks)
     worst = {"overshoot": LOST, "deviation": LOST, "locked": LONGEST, "settling": LONGEST}
     metrics = {name: np.where(found.diverged, worst.get(name, np.nan), found.metrics[name]) for name in MEASURED}
@@ -75,10 +75,10 @@ def runs(one: Loop, points: dict[str, np.ndarray], config: Judging, seed: int) -
     return metrics | {"stopped": found.stopped & ~found.diverged}
 
 
-def _block(one: Loop, lanes: Batch, at: np.ndarray, config: Judging) -> Any:
+def _block(loop: Loop, lanes: Batch, at: np.ndarray, config: Judging) -> Any:
     some = Batch({path: column[at] for path, column in lanes.values.items()}, lanes.keys[at])
     solver = FixedStep(step=config.step, duration=LONGEST, kinks=False)
-    return jax.device_get(run_batch(one, some, solver, MEASURED, engine=config.engine))
+    return jax.device_get(run_batch(loop, some, solver, MEASURED, engine=config.engine))
 
 
 def spots(speed: str) -> dict[str, dict[str, np.ndarray]]:
@@ -96,11 +96,11 @@ def _fits(at: dict[str, float], speed: str) -> bool:
     return not set(at) & set(other)
 
 
-def weak_spots(one: Loop, speed: str, config: Judging) -> dict[str, float]:
+def weak_spots(loop: Loop, speed: str, config: Judging) -> dict[str, float]:
     """Return the worst overshoot [%] under one deviation."""
     those = spots(speed)
     together = {name: np.concatenate([at[name] for at in those.values()]) for name in next(iter(those.values()))}
-    overshoot = runs(one, together, config, config.seed + 1)["overshoot"].reshape(len(those), -1)
+    overshoot = runs(loop, together, config, config.seed + 1)["overshoot"].reshape(len(those), -1)
     return dict(zip(those, (100 * overshoot.max(axis=1)).tolist(), strict=True))
 
 
@@ -116,10 +116,10 @@ def chance(happens: np.ndarray, confidence: float) -> dict[str, Any]:
     return {"percent": 100 * found.value, "low": 100 * found.low, "high": 100 * found.high, "count": int(happens.sum())}
 
 
-def on_samples(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging, samples: int) -> dict[str, Any]:
+def on_samples(loop: Loop, box: Box, fixed: Fixed, speed: str, config: Judging, samples: int) -> dict[str, Any]:
     """Probabilities and quantiles on so many points of the box."""
     points = drawn(box, speed, samples, config.seed)
-    found, least = runs(one, points, config, config.seed), floor(points, speed, fixed)
+    found, least = runs(loop, points, config, config.seed), floor(points, speed, fixed)
     widest = 4 * max(map(abs, (*box.first, *box.last)))  # the floor of the box, of a known speed
     overshoot, lost = found["overshoot"], found["distance"] / shortest(points, fixed) - 1
     off = found["deviation"] - floor(points, speed, fixed, two_sided=True)
@@ -144,7 +144,7 @@ def on_samples(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging, s
         "distance lost [%]": quantiles(100 * lost),
         "samples": samples,
     }
-    return said | ({"against the true speed": against_truth(one, points, found, config)} if speed == ESTIMATED else {})
+    return said | ({"against the true speed": against_truth(loop, points, found, config)} if speed == ESTIMATED else {})
 
 
 def quantiles(values: np.ndarray) -> dict[str, float]:
@@ -159,20 +159,22 @@ def seconds(time: float) -> str:
     return f"{time:.3f}" if time <= LONGEST else "never"
 
 
-def against_truth(one: Loop, points: Any, found: Any, config: Judging) -> dict[str, float]:
+def against_truth(loop: Loop, points: Any, found: Any, config: Judging) -> dict[str, float]:
     """Stopping distance, in per cent longer than under the same controller that sees the true speed with the same noise
     of the wheel."""
     from experiments.real_rig.loops import with_truth
 
     known = {name: value for name, value in points.items() if name != "bias"}
-    truth = runs(with_truth(one), known | {name: 0 * points["mass"] for name in ("first", "last")}, config, config.seed)
+    truth = runs(
+        with_truth(loop), known | {name: 0 * points["mass"] for name in ("first", "last")}, config, config.seed
+    )
     return quantiles(100 * (found["distance"] / truth["distance"] - 1))
 
 
-def in_corners(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging) -> dict[str, Any]:
+def in_corners(loop: Loop, box: Box, fixed: Fixed, speed: str, config: Judging) -> dict[str, Any]:
     """The worst of all corners, with a few noises each, and which it is."""
     points = corners(box, speed, config.corner_seeds)
-    found, least = runs(one, points, config, config.seed + 2), floor(points, speed, fixed)
+    found, least = runs(loop, points, config, config.seed + 2), floor(points, speed, fixed)
     worst = int(np.argmax(found["overshoot"]))
     return {
         "overshoot [%]": float(100 * found["overshoot"][worst]),

@@ -60,9 +60,9 @@ class Score:
             self.points, speed, fixed, two_sided=two_sided
         )
 
-    def __call__(self, one: Loop) -> float:
+    def __call__(self, loop: Loop) -> float:
         """Of a loop; a great number where a run diverges."""
-        found = runs(one, self.points, self.judging, self.config.seed)
+        found = runs(loop, self.points, self.judging, self.config.seed)
         self.rollouts += self.config.lanes
         each = sum(weight * found[name] for name, weight in self.weights.items()) - self.floors
         each = np.sort(np.nan_to_num(each, nan=1e3, posinf=1e3))
@@ -73,29 +73,29 @@ class Score:
 Free = dict[str, Any]
 
 
-def nelder_mead(score: Score, one: Loop, free: Free, config: Others) -> Loop:
+def nelder_mead(score: Score, loop: Loop, free: Free, config: Others) -> Loop:
     """Nelder and Mead's search in the coordinates of `tune`."""
-    coordinates = parameter_space(one, free)
+    coordinates = parameter_space(loop, free)
     options = {"maxfev": config.evaluations, "xatol": 1e-4, "fatol": 1e-6}
     found = minimize(
-        lambda z: score(_at(one, coordinates, z)), coordinates.place(one), method="Nelder-Mead", options=options
+        lambda z: score(_at(loop, coordinates, z)), coordinates.place(loop), method="Nelder-Mead", options=options
     )
-    return _at(one, coordinates, found.x)
+    return _at(loop, coordinates, found.x)
 
 
-def cma_es(score: Score, one: Loop, free: Free, config: Others) -> Loop:
+def cma_es(score: Score, loop: Loop, free: Free, config: Others) -> Loop:
     """CMA-ES in the coordinates of `tune`."""
-    coordinates = parameter_space(one, free)
+    coordinates = parameter_space(loop, free)
     options = {"maxfevals": config.evaluations, "verbose": -9, "seed": config.seed, "verb_log": 0}
-    search = cma.CMAEvolutionStrategy(coordinates.place(one), 0.5, options)
+    search = cma.CMAEvolutionStrategy(coordinates.place(loop), 0.5, options)
     while not search.stop():
         asked = search.ask()
-        search.tell(asked, [score(_at(one, coordinates, z)) for z in asked])
-    return _at(one, coordinates, search.result.xbest)
+        search.tell(asked, [score(_at(loop, coordinates, z)) for z in asked])
+    return _at(loop, coordinates, search.result.xbest)
 
 
-def _at(one: Loop, coordinates: Any, z: Any) -> Loop:
-    return replace(one, {path: np.asarray(value) for path, value in coordinates.values(z).items()})
+def _at(loop: Loop, coordinates: Any, z: Any) -> Loop:
+    return replace(loop, {path: np.asarray(value) for path, value in coordinates.values(z).items()})
 
 
 def designs(config: Others, box: Box, fixed: Fixed) -> dict[str, list[np.ndarray]]:
@@ -140,7 +140,7 @@ def contenders(
     robust: dict[str, list[np.ndarray]],
     estimator: Any,
     score: Score,
-    told: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> dict[str, tuple[Loop, int]]:
     """Return loops by name, and the number of runs behind each. `robust`: the gains of `designs`."""
 
@@ -156,7 +156,7 @@ def contenders(
                 those[int(np.argmin([score(one) for one in those]))],
                 score.rollouts,
             )
-        told(name)
+        report(name)
     cured: Any = load("slip-cured", integrated=False).loop
     target = FilteredSlip(slip=fixed.slip, time_constant=cured.reference.time_constant)
     first = ProportionalFeedback(gain=np.asarray(cured.controller.controller.gain, float))
@@ -170,7 +170,7 @@ def contenders(
         score.rollouts = 0
         one = loop(fixed, controller, speed, estimator=estimator)
         found[name] = (search(score, one, free, config), score.rollouts)
-        told(name)
+        report(name)
     return found
 
 
