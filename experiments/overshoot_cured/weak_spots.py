@@ -70,19 +70,19 @@ def lanes(box: Box, loop: Loop, spot: Spot) -> dict[str, np.ndarray]:
     """The box's lanes with one thing wrong."""
     if spot.speed is not None:
         box = dataclasses.replace(box, speeds=(spot.speed,))
-    found = box.lanes()
+    box_lanes = box.lanes()
     wrong = {path: factor * float(get(loop, path)) for path, factor in spot.factors} | dict(spot.values)
-    return found | {path: np.full(len(found["plant.mass"]), value) for path, value in wrong.items()}
+    return box_lanes | {path: np.full(len(box_lanes["plant.mass"]), value) for path, value in wrong.items()}
 
 
 def everything(box: Box, loop: Loop) -> tuple[Batch, list[str]]:
     """All spots but noise as one batch, which is compiled once, and the name of each lane's spot."""
-    those = [lanes(box, loop, spot) for spot in SPOTS]
-    paths = dict.fromkeys(path for each in those for path in each)
-    count = [len(each["plant.mass"]) for each in those]
+    spot_lanes = [lanes(box, loop, spot) for spot in SPOTS]
+    paths = dict.fromkeys(path for each in spot_lanes for path in each)
+    count = [len(each["plant.mass"]) for each in spot_lanes]
     columns = {
         path: np.concatenate(
-            [each.get(path, np.full(n, float(get(loop, path)))) for each, n in zip(those, count, strict=True)]
+            [each.get(path, np.full(n, float(get(loop, path)))) for each, n in zip(spot_lanes, count, strict=True)]
         )
         for path in paths
     }
@@ -100,11 +100,11 @@ def weak_spots(loop: Loop, box: Box, solver: FixedStep, seeds: int = 4) -> dict[
     scaled = dataclasses.replace(loop, sensor=SpeedScale())
     batch, names = everything(box, scaled)
     runs = jax.device_get(jax.jit(lambda loop: run_batch(loop, batch, solver, OVERSHOOT))(scaled))
-    found = {spot.name: _worst(runs, np.array(names) == spot.name) for spot in SPOTS}
+    worst = {spot.name: _worst(runs, np.array(names) == spot.name) for spot in SPOTS}
     shaken = dataclasses.replace(loop, sensor=Noise(slip=NOISE, period=1e-3))
     drawn = noisy(box, seeds)
     runs = jax.device_get(jax.jit(lambda loop: run_batch(loop, drawn, solver, OVERSHOOT))(shaken))
-    return {**found, NOISY: _worst(runs, np.full(drawn.size, True))}
+    return {**worst, NOISY: _worst(runs, np.full(drawn.size, True))}
 
 
 def _worst(runs: Any, lanes: np.ndarray) -> float | None:

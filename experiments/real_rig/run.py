@@ -99,25 +99,27 @@ def printed(speed: str, results: dict[str, dict[str, Any]]) -> None:
     """The table, in two: weak spots, and the rest."""
     record.print_rows(
         f"Speed {speed}: worst overshoot [%] where one thing is wrong",
-        [{"controller": name, **one["weak spots: overshoot [%]"]} for name, one in results.items()],
+        [{"controller": name, **result["weak spots: overshoot [%]"]} for name, result in results.items()],
     )
-    record.print_rows(f"Speed {speed}: the box", [{"controller": name, **row(one)} for name, one in results.items()])
+    record.print_rows(
+        f"Speed {speed}: the box", [{"controller": name, **row(result)} for name, result in results.items()]
+    )
 
 
-def row(one: dict[str, Any]) -> dict[str, Any]:
+def row(result: dict[str, Any]) -> dict[str, Any]:
     """Return a line of the table."""
 
     def interval(name: str) -> str:
-        p = one["box"][name]
+        p = result["box"][name]
         return f"{p['percent']:.4g} ({p['low']:.3g}-{p['high']:.3g})"
 
-    box, proof = one["box"], one["proof"]
+    box, proof = result["box"], result["proof"]
     truth = box.get("against the true speed", {"median": 0.0, "95 %": 0.0})
     rate = proof.get("decay [1/s]")
     return {
-        "objective": f"{one['objective']:.4f}",
-        "of both sides": f"{one['objective, both sides']:.4f}",
-        "worst corner [%]": f"{one['corners']['overshoot [%]']:.1f}",
+        "objective": f"{result['objective']:.4f}",
+        "of both sides": f"{result['objective, both sides']:.4f}",
+        "worst corner [%]": f"{result['corners']['overshoot [%]']:.1f}",
         "P(> 1 %) [%]": interval("overshoot > 1 %"),
         "P(> 5 %) [%]": interval("overshoot > 5 %"),
         "P(locks) [%]": interval("locks"),
@@ -129,7 +131,7 @@ def row(one: dict[str, Any]) -> dict[str, Any]:
         "lost median [%]": f"{box['distance lost [%]']['median']:.2f}",
         "longer than with the true speed, median, 95 % [%]": f"{truth['median']:.2f}, {truth['95 %']:.2f}",
         "certificate": proof["said"] + ("" if rate is None else f", {rate:.2g} /s"),
-        "runs to find": one["runs to find"],
+        "runs to find": result["runs to find"],
     }
 
 
