@@ -10,7 +10,7 @@ from project import ROOT
 from experiments._shared import numbers
 
 STUDIES = ROOT / "experiments"
-QUICK = ("lab_rig", "mean_intervals", "worst_case")  # run in two minutes each; the others take up to hours
+QUICK = ("lab_rig", "mean_intervals")  # take one to three minutes each; the others up to hours
 
 
 def test_a_number_beyond_the_tolerance_is_named(tmp_path):
