@@ -36,9 +36,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 gc.disable()  # until all is imported: what imports make stays, and looking through it took a fourth of the time
 
 import jax  # noqa: E402  after its environment
+import jaxtyping  # noqa: E402  before diffabs, whose shapes are then those of jaxtyping
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+import shape_checks  # noqa: E402
 
+shape_checks.install()
 jax.config.update("jax_enable_x64", True)
 
 DEAREST = """
@@ -75,6 +78,14 @@ def pytest_collection_finish():
     gc.freeze()
     gc.set_threshold(200_000, 10, 50)
     gc.enable()
+
+
+@pytest.fixture
+def refused_shapes():
+    """For tests of the package's own words about a wrong shape: without the checks of annotations."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(autouse=True)

@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core import shapes
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.meanings import document_fields
 from diffabs.core.protocols import Ending, Plant, Sample
-from diffabs.core.types import AnyArray, Bool, Int, PyTree, Scalar
+from diffabs.core.types import AnyArray, Bool, PyTree, Scalar
 from diffabs.engine import convert
 
 if TYPE_CHECKING:
@@ -179,7 +180,7 @@ class Trajectory(NamedTuple):
     sample: Sample
     measured: PyTree
     state: PyTree
-    running: AnyArray
+    running: shapes.Bool[AnyArray, "*runs instants"]
 
     def finite(self) -> Scalar:
         """Return True if every number of `sample` is finite; `measured` and `state` are not checked."""
@@ -194,7 +195,7 @@ class Slide(NamedTuple):
         t: Time at which it begins [s]; NaN without a slide.
     """
 
-    comparison: Int
+    comparison: shapes.Int[AnyArray, "*runs"]
     t: Scalar
 
 
@@ -217,14 +218,14 @@ class Run(NamedTuple):
         fault: Reason for `diverged` as a number (`simulate.faults.Fault`); None if it is not known. `repr` has words.
     """
 
-    metrics: dict[str, PyTree]
-    stopped: Bool
-    diverged: Bool
-    timed_out: Bool
+    metrics: dict[str, shapes.Float[AnyArray, "*runs"]]
+    stopped: shapes.Bool[AnyArray, "*runs"]
+    diverged: shapes.Bool[AnyArray, "*runs"]
+    timed_out: shapes.Bool[AnyArray, "*runs"]
     ending: Ending
     trajectory: Trajectory | None
     slide: Slide | None = None
-    fault: Int | None = None
+    fault: shapes.Int[AnyArray, "*runs"] | None = None
 
     @property
     @default_flags()

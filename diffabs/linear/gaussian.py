@@ -16,7 +16,8 @@ from jax.core import Tracer
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Plant
 from diffabs.core.renamed import refuse_old_names
-from diffabs.core.types import AnyArray, Bool
+from diffabs.core.shapes import Bool, Float, Num
+from diffabs.core.types import AnyArray, Rows
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.regulator import dlqr
@@ -38,13 +39,18 @@ class Filter(NamedTuple):
         stabilising: Whether P is proven to be the stabilising solution, as in `Riccati`.
     """
 
-    gain: AnyArray
-    P: AnyArray
-    stabilising: Bool
+    gain: Float[AnyArray, "*batch n p"]
+    P: Float[AnyArray, "*batch n n"]
+    stabilising: Bool[AnyArray, "*batch"]
 
 
 @default_flags()
-def kalman(A: AnyArray, C: AnyArray, W: AnyArray, V: AnyArray) -> Filter:
+def kalman(
+    A: Num[AnyArray, "n n"] | Rows,
+    C: Num[AnyArray, "p n"] | Rows,
+    W: Num[AnyArray, "n n"] | Rows,
+    V: Num[AnyArray, "p p"] | Rows,
+) -> Filter:
     """Return the steady-state Kalman filter of x+ = A x + w, y = C x + v; NaN where no such filter exists.
 
     The gain L corrects the prediction: x^ = x^- + L (y - C x^-). The predictor's gain is A L. The result is

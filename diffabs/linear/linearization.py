@@ -20,6 +20,7 @@ from jax.flatten_util import ravel_pytree
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes
+from diffabs.core.shapes import Float
 from diffabs.core.types import AnyArray, Array, Bool, PyTree, Scalar
 from diffabs.parts.plants.wheel import FROZEN_OUTPUTS
 
@@ -37,8 +38,8 @@ MAX_SLOPE_JUMP = 1e-3  # largest jump of a slope that counts as none, relative t
 class StateSpace(NamedTuple):
     """A linear system x' = A x + B u, or x+ = A x + B u: A (n, n), B (n, m)."""
 
-    A: AnyArray
-    B: AnyArray
+    A: Float[AnyArray, "n n"]
+    B: Float[AnyArray, "n m"]
 
 
 @default_flags()

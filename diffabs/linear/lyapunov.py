@@ -14,9 +14,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from numpy.typing import ArrayLike
 
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.types import Array, PyTree
+from diffabs.core.shapes import Float, Num
+from diffabs.core.types import AnyArray, Array, PyTree
 
 MAX_SMITH_STEPS = 50  # C^(2^50) is 0 for a spectral radius of 1 - 1e-13, and not for a radius of 1
 
@@ -29,12 +31,12 @@ class Lyapunov(NamedTuple):
         residual: Relative residual: the norm of the left side over the sum of the norms of its terms.
     """
 
-    P: Array
-    residual: Array
+    P: Float[Array, "*batch n n"]
+    residual: Float[Array, "*batch"]
 
 
 @default_flags()
-def lyapunov(A: Array, Q: Array) -> Lyapunov:
+def lyapunov(A: Num[AnyArray, "n n"], Q: Num[AnyArray, "n n"]) -> Lyapunov:
     """Return P of A' P + P A + Q = 0 and its relative residual.
 
     For a stable A, P is the integral of exp(A't) Q exp(At). P is differentiable to any order in both modes; the
@@ -54,7 +56,7 @@ def lyapunov(A: Array, Q: Array) -> Lyapunov:
 
 
 @default_flags()
-def discrete_lyapunov(A: Array, Q: Array) -> Lyapunov:
+def discrete_lyapunov(A: Num[AnyArray, "n n"], Q: Num[AnyArray, "n n"]) -> Lyapunov:
     """Return P of A' P A - P + Q = 0 and its relative residual.
 
     For a stable A, P is the sum of (A')^k Q A^k. P is differentiable to any order in both modes; the residual counts as
@@ -76,7 +78,7 @@ def _solve_vectorised(operator: jax.Array, Q: Array) -> jax.Array:
     return jnp.linalg.solve(operator, -Q.ravel()).reshape(Q.shape)
 
 
-def as_float_arrays(*values: PyTree) -> tuple[PyTree, ...]:
+def as_float_arrays(*values: ArrayLike) -> tuple[Array, ...]:
     """Return the arguments as arrays of one common floating-point type."""
     values = tuple(jnp.asarray(x) if isinstance(x, list | tuple) else x for x in values)
     kind = jnp.result_type(float, *values)
@@ -103,7 +105,7 @@ def frobenius_norm(X: jax.Array, axes: Any = (0, 1)) -> jax.Array:
     return jnp.sqrt(jnp.sum(X * X, axes))
 
 
-def transpose(X: jax.Array) -> jax.Array:
+def transpose(X: Float[Array, "n m batch"]) -> Float[Array, "m n batch"]:
     """Return the transpose of each matrix, shape (rows, columns, batch)."""
     return jnp.swapaxes(X, 0, 1)
 
@@ -116,12 +118,14 @@ def times(*factors: jax.Array) -> jax.Array:
     return reduce(lambda X, Y: reduce(add, (X[:, k, None] * Y[None, k] for k in range(len(Y)))), factors)
 
 
-def eye(n: int, like: jax.Array) -> jax.Array:
+def eye(n: int, like: Float[Array, "... batch"]) -> Float[Array, "{n} {n} batch"]:
     """Return an identity matrix (n, n, batch) for each matrix of `like`, of its data type."""
     return jnp.broadcast_to(jnp.eye(n, dtype=like.dtype)[..., None], (n, n, like.shape[-1]))
 
 
-def gauss_jordan_solve(M: jax.Array, W: jax.Array) -> tuple[jax.Array, jax.Array]:
+def gauss_jordan_solve(
+    M: Float[Array, "n n batch"], W: Float[Array, "n m batch"]
+) -> tuple[Float[Array, "n m batch"], Float[Array, " batch"]]:
     """Return M^-1 W and log abs det M for each M (n, n, batch), by elimination with partial pivoting."""
     rows = jnp.arange(len(M))[:, None]
 
@@ -141,7 +145,7 @@ def gauss_jordan_solve(M: jax.Array, W: jax.Array) -> tuple[jax.Array, jax.Array
     return T[:, len(M) :], log
 
 
-def cholesky(R: jax.Array) -> jax.Array:
+def cholesky(R: Float[Array, "n n batch"]) -> Float[Array, "n n batch"]:
     """Return the lower triangular L (n, n, batch) with L L' = R; not finite where R is not positive definite."""
     L = jnp.zeros_like(R)
     for k in range(len(R)):
@@ -151,7 +155,9 @@ def cholesky(R: jax.Array) -> jax.Array:
     return L
 
 
-def solve_stein(C: jax.Array, *right: jax.Array) -> tuple[jax.Array, ...]:
+def solve_stein(
+    C: Float[Array, "n n batch"], *right: Float[Array, "n n batch"]
+) -> tuple[Float[Array, "n n batch"], ...]:
     """Return X of C' X C - X + W = 0 for each W of `right`, all (n, n, batch); NaN where C is not stable.
 
     Smith's squared method: X <- X + C' X C, C <- C^2. C is not stable where its powers do not vanish.

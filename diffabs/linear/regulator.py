@@ -13,10 +13,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from numpy.typing import ArrayLike
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.types import AnyArray, Bool, PyTree
+from diffabs.core.shapes import Bool, Float, Num
+from diffabs.core.types import AnyArray, Rows
 from diffabs.linear.riccati import care, dare, symmetric_part
 from diffabs.linear.stabilisability import unstabilisable_mode
 from diffabs.linear.weights import as_weight_matrix, check_symmetric
@@ -32,14 +34,20 @@ class Regulator(NamedTuple):
         stabilising: Whether P is proven to be the stabilising solution, as in `Riccati`.
     """
 
-    gain: AnyArray
-    P: AnyArray
-    residual: PyTree
-    stabilising: Bool
+    gain: Float[AnyArray, "*batch m n"]
+    P: Float[AnyArray, "*batch n n"]
+    residual: Float[AnyArray, "*batch"]
+    stabilising: Bool[AnyArray, "*batch"]
 
 
 @default_flags()
-def lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Regulator:
+def lqr(
+    A: Num[AnyArray, "n n"] | Rows,
+    B: Num[AnyArray, "n m"] | Rows,
+    Q: Num[AnyArray, "n n"] | Rows,
+    R: Num[AnyArray, "m m"] | Rows,
+    S: Num[AnyArray, "n m"] | Rows | None = None,
+) -> Regulator:
     """Return the regulator that minimises the integral of x'Q x + 2 x'S u + u'R u for x' = A x + B u.
 
     Args:
@@ -89,7 +97,13 @@ def lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None =
 
 
 @default_flags()
-def dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Regulator:
+def dlqr(
+    A: Num[AnyArray, "n n"] | Rows,
+    B: Num[AnyArray, "n m"] | Rows,
+    Q: Num[AnyArray, "n n"] | Rows,
+    R: Num[AnyArray, "m m"] | Rows,
+    S: Num[AnyArray, "n m"] | Rows | None = None,
+) -> Regulator:
     """Return the regulator that minimises the sum of x'Q x + 2 x'S u + u'R u for x(k+1) = A x(k) + B u(k).
 
     >>> import jax
@@ -114,21 +128,35 @@ def dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
-def _solve_lqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None) -> Regulator:
+def _solve_lqr(
+    A: Num[AnyArray, "n n"] | Rows,
+    B: Num[AnyArray, "n m"] | Rows,
+    Q: Num[AnyArray, "n n"] | Rows,
+    R: Num[AnyArray, "m m"] | Rows,
+    S: Num[AnyArray, "n m"] | Rows | None,
+) -> Regulator:
     riccati = care(A, B, Q, R, S)
     turned = jnp.asarray(B).T @ riccati.P + (0.0 if S is None else jnp.asarray(S).T)
     return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R, riccati.P.dtype)), turned), *riccati)
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
-def _solve_dlqr(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None) -> Regulator:
+def _solve_dlqr(
+    A: Num[AnyArray, "n n"] | Rows,
+    B: Num[AnyArray, "n m"] | Rows,
+    Q: Num[AnyArray, "n n"] | Rows,
+    R: Num[AnyArray, "m m"] | Rows,
+    S: Num[AnyArray, "n m"] | Rows | None,
+) -> Regulator:
     riccati = dare(A, B, Q, R, S)
     b = jnp.asarray(B)
     turned = b.T @ riccati.P @ jnp.asarray(A) + (0.0 if S is None else jnp.asarray(S).T)
     return Regulator(-jnp.linalg.solve(symmetric_part(jnp.asarray(R)) + b.T @ riccati.P @ b, turned), *riccati)
 
 
-def _check_matrices(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None, *, discrete: bool) -> None:
+def _check_matrices(
+    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, S: ArrayLike | None, *, discrete: bool
+) -> None:
     """Raise ValueError for matrices of numbers that have no regulator; accept traced ones."""
     if any(isinstance(x, Tracer) for x in (A, B, Q, R)):
         return

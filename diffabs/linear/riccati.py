@@ -20,10 +20,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from numpy.typing import ArrayLike
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.types import Any, AnyArray, Array, Bool, Matrix, PyTree
+from diffabs.core.shapes import Bool, Float, Num
+from diffabs.core.types import Any, AnyArray, Array, Matrix, PyTree, Rows
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.lyapunov import discrete_lyapunov as _discrete_lyapunov
 from diffabs.linear.lyapunov import lyapunov as _lyapunov
@@ -54,13 +56,19 @@ class Riccati(NamedTuple):
         stabilising: Whether P is proven to be the stabilising solution.
     """
 
-    P: AnyArray
-    residual: PyTree
-    stabilising: Bool
+    P: Float[AnyArray, "*batch n n"]
+    residual: Float[AnyArray, "*batch"]
+    stabilising: Bool[AnyArray, "*batch"]
 
 
 @default_flags()
-def care(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Riccati:
+def care(
+    A: Num[AnyArray, "n n"] | Rows,
+    B: Num[AnyArray, "n m"] | Rows,
+    Q: Num[AnyArray, "n n"] | Rows,
+    R: Num[AnyArray, "m m"] | Rows,
+    S: Num[AnyArray, "n m"] | Rows | None = None,
+) -> Riccati:
     """Return the stabilising solution P of the continuous Riccati equation, with its proof.
 
         A' P + P A - (P B + S) R^-1 (P B + S)' + Q = 0,     u = -R^-1 (B' P + S') x
@@ -110,7 +118,13 @@ def care(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None 
 
 
 @default_flags()
-def dare(A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: AnyArray | None = None) -> Riccati:
+def dare(
+    A: Num[AnyArray, "n n"] | Rows,
+    B: Num[AnyArray, "n m"] | Rows,
+    Q: Num[AnyArray, "n n"] | Rows,
+    R: Num[AnyArray, "m m"] | Rows,
+    S: Num[AnyArray, "n m"] | Rows | None = None,
+) -> Riccati:
     """Return the stabilising solution P of the discrete Riccati equation, with its proof.
 
         A' P A - P - (A' P B + S) (R + B' P B)^-1 (A' P B + S)' + Q = 0,     u = -(R + B' P B)^-1 (B' P A + S') x
@@ -136,7 +150,7 @@ def symmetric_part(X: AnyArray) -> AnyArray:
     return (X + X.T) / 2
 
 
-def _riccati(solution: Callable, A: AnyArray, B: AnyArray, Q: AnyArray, R: AnyArray, S: Any) -> Riccati:
+def _riccati(solution: Callable, A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, S: Any) -> Riccati:
     A, B, Q, R = as_float_arrays(A, B, Q, R)
     S = jnp.zeros_like(B) if S is None else as_float_arrays(S)[0].astype(B.dtype)
     if jnp.iscomplexobj(B) or jnp.iscomplexobj(S):

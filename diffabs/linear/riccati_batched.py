@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from diffabs.core.types import Any, Array, PyTree, Scalar
+from diffabs.core.shapes import Float
+from diffabs.core.types import Any, Array, Numbers, PyTree
 from diffabs.linear.lyapunov import (
     cholesky,
     eye,
@@ -69,7 +70,13 @@ def _batch_over_matrices(solver: Callable) -> Callable:
 
 
 @_batch_over_matrices
-def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> tuple[Array, Array]:
+def solve_care(
+    A: Float[Array, "n n batch"],
+    B: Float[Array, "n m batch"],
+    Q: Float[Array, "n n batch"],
+    R: Float[Array, "m m batch"],
+    S: Float[Array, "n m batch"],
+) -> tuple[Float[Array, "n n batch"], Float[Array, " batch"]]:
     """Return (P, residual) of continuous equations, shapes (batch, n, n) and (batch,); P is NaN where it is not proven.
 
     R is symmetric positive definite.
@@ -87,7 +94,13 @@ def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
 
 
 @_batch_over_matrices
-def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> tuple[Array, Array]:
+def solve_dare(
+    A: Float[Array, "n n batch"],
+    B: Float[Array, "n m batch"],
+    Q: Float[Array, "n n batch"],
+    R: Float[Array, "m m batch"],
+    S: Float[Array, "n m batch"],
+) -> tuple[Float[Array, "n n batch"], Float[Array, " batch"]]:
     """Return (P, residual) of discrete equations, shapes (batch, n, n) and (batch,); P is NaN where it is not proven.
 
     R is symmetric positive semidefinite, and singular only if R + B' P B > 0.
@@ -246,7 +259,7 @@ def _solution_from_sign(Z: jax.Array) -> jax.Array:
 # Steps 3 and 4
 
 
-def _refine_and_prove(newton: Callable, P: jax.Array, shift: Scalar = 0.0) -> jax.Array:
+def _refine_and_prove(newton: Callable, P: Float[Array, "n n batch"], shift: Numbers = 0.0) -> jax.Array:
     """Return P after Newton-Kleinman steps until it moves by less than 1e-7 of P + shift, or NaN without a proof."""
 
     def goes_on(carry: PyTree) -> jax.Array:

@@ -11,6 +11,7 @@ import numpy as np
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace
+from diffabs.core.shapes import Float
 from diffabs.core.types import JsonObject, Scalar
 from diffabs.linear.opened_loop import OpenLoop, open_loop
 from diffabs.linear.stability_margins import Margins, margins
@@ -114,7 +115,7 @@ def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, tar
     return Band(tuple(systems), len(corners))
 
 
-def low_discrepancy_points(count: int, dimensions: int) -> np.ndarray:
+def low_discrepancy_points(count: int, dimensions: int) -> Float[np.ndarray, "{count} {dimensions}"]:
     """Return points (count, dimensions) that fill the unit cube evenly, the same in every call.
 
     Coordinate i of point k is 1/2 + k/x^i modulo 1, both counted from 1. Here x is the root of x^(d+1) = x + 1
@@ -127,7 +128,7 @@ def low_discrepancy_points(count: int, dimensions: int) -> np.ndarray:
     return (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
 
 
-def frequencies(systems: Sequence[OpenLoop], decades: float = 1.5, count: int = 400) -> np.ndarray:
+def frequencies(systems: Sequence[OpenLoop], decades: float = 1.5, count: int = 400) -> Float[np.ndarray, " {count}"]:
     """Return logarithmically spaced frequencies (count,) [rad/s], `decades` beyond the crossovers of these loops.
 
     They end at half the lowest sampling rate at most. Without any crossover they surround 1 rad/s.

@@ -21,6 +21,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from diffabs.core.jax_flags import default_flags
+from diffabs.core.shapes import Bool, Float
 from diffabs.core.types import Any, JsonObject
 from diffabs.linear.delay_steps import LEAST_DISTANCE, REACHING, DelayedLoop
 from diffabs.linear.opened_loop import OpenLoop
@@ -116,11 +117,11 @@ class Crossovers(NamedTuple):
         factors: 1/|L| at the frequencies `phase_at`.
     """
 
-    gain_at: np.ndarray
-    falls: np.ndarray
-    phases: np.ndarray
-    phase_at: np.ndarray
-    factors: np.ndarray
+    gain_at: Float[np.ndarray, " gains"]
+    falls: Bool[np.ndarray, " gains"]
+    phases: Float[np.ndarray, " gains"]
+    phase_at: Float[np.ndarray, " phases"]
+    factors: Float[np.ndarray, " phases"]
 
 
 @default_flags()

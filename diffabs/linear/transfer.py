@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from jax.typing import ArrayLike
 
-from diffabs.core.types import Any, Matrix
+from diffabs.core.shapes import Float
+from diffabs.core.types import Any
 
 WHOLE_PERIOD_TOLERANCE = 1e-9  # of a period: how far from whole periods the delay of a sampled system may be
 
@@ -31,10 +32,10 @@ class Transfer(NamedTuple):
         delay: Pure delay [s], at least 0, a whole number of periods for a sampled system.
     """
 
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-    D: np.ndarray
+    A: Float[np.ndarray, "n n"]
+    B: Float[np.ndarray, "n m"]
+    C: Float[np.ndarray, "p n"]
+    D: Float[np.ndarray, "p m"]
     period: float | None = None
     delay: float = 0.0
 
@@ -104,7 +105,7 @@ def check_transfer(system: Transfer) -> Transfer:
     return system._replace(**matrices)
 
 
-def _as_matrix(name: str, value: Matrix) -> np.ndarray:
+def _as_matrix(name: str, value: object) -> np.ndarray:
     try:
         matrix = np.asarray(value, float)
     except (TypeError, ValueError):
@@ -137,7 +138,7 @@ def _delay_one_period(system: Transfer) -> Transfer:
     return system._replace(A=a, B=b, C=np.hstack([system.C, system.D]), D=np.zeros_like(system.D))
 
 
-def to_control(system: Transfer, *, pade: int | None = None) -> Matrix:
+def to_control(system: Transfer, *, pade: int | None = None) -> Any:
     """Return a system as python-control's `StateSpace`, with whole periods of delay as states.
 
     Args:

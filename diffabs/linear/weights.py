@@ -1,8 +1,7 @@
 """Weights of a quadratic cost."""
 
 import numpy as np
-
-from diffabs.core.types import Scalar
+from numpy.typing import ArrayLike
 
 SYMMETRY_TOLERANCE = 1e-12  # difference of X[i, j] and X[j, i] that is rounding, relative to the entry's size
 
@@ -16,7 +15,7 @@ def is_symmetric(X: np.ndarray) -> bool:
     return bool((np.abs(X - X.T) <= SYMMETRY_TOLERANCE * size).all())
 
 
-def check_symmetric(name: str, value: Scalar, size: int) -> None:
+def check_symmetric(name: str, value: object, size: int) -> None:
     """Raise ValueError for a matrix that is not finite and symmetric up to rounding, of shape (size, size)."""
     array = np.asarray(value, float)
     if array.shape != (size, size):
@@ -25,7 +24,7 @@ def check_symmetric(name: str, value: Scalar, size: int) -> None:
         raise ValueError(f"{name} = {array.tolist()} is not symmetric and finite")
 
 
-def as_weight_matrix(name: str, value: Scalar, size: int, *, definite: bool) -> np.ndarray:
+def as_weight_matrix(name: str, value: ArrayLike, size: int, *, definite: bool) -> np.ndarray:
     """Return a weight, a matrix, diagonal or (for size 1) number, as a symmetric (size, size) matrix.
 
     Args:

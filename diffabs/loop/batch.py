@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core import kinds
+from diffabs.core import kinds, shapes
 from diffabs.core.pytree import canonical_dtypes, get, parameters, replace, stack_lists
 from diffabs.core.summary import Summary
-from diffabs.core.types import Params, Part, PyTree
+from diffabs.core.types import AnyArray, Params, Part, PyTree
 from diffabs.engine.admissible import first_refusal
 from diffabs.engine.types import Solver
 
@@ -37,9 +37,9 @@ class Batch:
     """
 
     values: Params = dataclasses.field(default_factory=dict)
-    keys: PyTree = None
-    weights: PyTree = None
-    durations: Any = None
+    keys: shapes.Shaped[AnyArray, " runs"] | Sequence[int] | None = None
+    weights: shapes.Float[AnyArray, " runs"] | Sequence[float] | None = None
+    durations: shapes.Float[AnyArray, " runs"] | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         """Raise a ValueError if `values` are no mapping, or a column has no numbers (or, for `keys`, no keys)."""

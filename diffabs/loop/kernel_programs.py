@@ -14,7 +14,7 @@ from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, get, parameters
-from diffabs.core.types import Array
+from diffabs.core.types import AnyArray, Array
 from diffabs.engine.drive.engine import EngineError
 from diffabs.engine.types import Solver
 from diffabs.loop.batch import Batch
@@ -64,7 +64,7 @@ def trace_kernel(
         ValueError: A kernel cannot make the runs; the message says why.
     """
 
-    def run(x: Array) -> dict[str, Array]:
+    def run(x: Array) -> dict[str, AnyArray]:
         lanes = Batch({path: x[i][None] for i, path in enumerate(paths)}, jnp.zeros(1, int))
         return run_batch(loop, lanes, solver, objectives, together=False, engine="kernel").metrics
 

@@ -29,7 +29,6 @@ from diffabs.parts.plants.lab_rig import LabRigState
 from diffabs.parts.references import FixedSlip
 from diffabs.parts.stops import SpeedReached
 from diffabs.scenario.defaults import braking
-from experiments._shared.numbers import store_numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,4 +214,4 @@ def main(config: Config | None = None) -> dict[str, Any]:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    store_numbers(__file__, main())
+    main()

@@ -10,6 +10,7 @@ import textwrap
 import urllib.request
 
 import jax.numpy as jnp
+import jaxtyping
 import matplotlib.image
 import numpy as np
 import pytest
@@ -132,7 +133,6 @@ def test_4096_masses_and_roads_in_one_call():
 @pytest.mark.slow
 def test_values_have_the_shapes_of_the_table():
     """Names for sizes, such as `runs`, mean the same number in every row."""
-    jaxtyping = pytest.importorskip("jaxtyping", reason="jaxtyping comes with the group `ecosystem`")
     names = {name: getattr(jaxtyping, name) for name in ("Array", "Bool", "Float", "Int")}
     exec(compile(CODE.partition("masses, grips =")[0], "library.md", "exec"), names)
     loop, solver, metrics = names["rig"], d.FixedStep(1e-3, 0.02), {"iae": objectives.IAE()}

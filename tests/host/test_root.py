@@ -17,7 +17,7 @@ from diffabs.uncertainty.sweep.study import Study
 from diffabs.uncertainty.sweep.variables import Space
 
 SOLVER = d.FixedStep(1e-3, 0.01)
-HEAVY = ("optax", "cvxpy", "matplotlib", "pyarrow", "scipy.optimize")
+HEAVY = ("optax", "cvxpy", "matplotlib", "pyarrow", "scipy.optimize", "jaxtyping")
 
 
 def python(program):

@@ -326,6 +326,7 @@ def test_a_covariance_that_is_not_symmetric_is_refused(name):
 @killed_by("linear.gaussian", 'as_weight_matrix(name, covariance, size, definite=name == "V")', "pass")
 @killed_by("linear.gaussian", 'definite=name == "V"', "definite=False")
 @killed_by("linear.gaussian", 'definite=name == "V"', "definite=True")
+@pytest.mark.usefixtures("refused_shapes")
 def test_the_filter_needs_covariances():
     """Unlike a regulator's Q: a variance is not negative, and V has an inverse. Without w a stable state is known."""
     for w, v, message in ((-0.1, 1.0, "W is not positive semidefinite"), (1.0, 0.0, "V is not positive definite")):
@@ -499,6 +500,7 @@ def test_no_silent_failure_among_a_thousand():
     ],
 )
 @killed_by("linear.regulator", "not isinstance(S, Tracer) and", "False and")
+@pytest.mark.usefixtures("refused_shapes")
 def test_bad_matrices(change, message):
     a, b = rig()
     given = {"A": a, "B": b, "Q": np.eye(2), "R": np.eye(1)} | change

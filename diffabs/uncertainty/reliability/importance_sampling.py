@@ -23,6 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.shapes import Bool, Float, Int
+
 COMPONENT_COUNTS = (1, 2, 4, 8, 16)  # numbers of centres that are tried
 EM_STEPS = 15  # steps of expectation maximisation
 DEFENSIVE_SHARE = 0.1  # of the draws, shared equally by all centres: the known failures may miss parts of F
@@ -72,7 +74,7 @@ class ImportanceEstimate(NamedTuple):
     estimate: ProbabilityEstimate
     effective_samples: float
     predicted_cov: float
-    centres: np.ndarray
+    centres: Float[np.ndarray, "k d"]
 
 
 class CountedScore:
@@ -90,11 +92,11 @@ class CountedScore:
         self.gradients: int = 0
         self.diverged: int = 0
 
-    def __call__(self, z: np.ndarray) -> np.ndarray:
+    def __call__(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         self.evaluations += len(z)
         return self._clean(self.score(z), z)
 
-    def gradient(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def gradient(self, z: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n d"]]:
         """Return the score (n,) and its derivative (n, d) at `z` (n, d)."""
         assert self.slope is not None
         self.gradients += len(z)
@@ -133,17 +135,17 @@ class Mixture(NamedTuple):
         scales: Standard deviations s across the centre's direction, shape (k,).
     """
 
-    centres: np.ndarray
-    weights: np.ndarray
-    scales: np.ndarray
+    centres: Float[np.ndarray, "k d"]
+    weights: Float[np.ndarray, " k"]
+    scales: Float[np.ndarray, " k"]
 
     @property
-    def directions(self) -> np.ndarray:
+    def directions(self) -> Float[np.ndarray, "k d"]:
         """Unit vectors u from the origin to the centres, shape (k, d); the first axis for a centre at the origin."""
         size = np.linalg.norm(self.centres, axis=1, keepdims=True)
         return np.where(size > 0, self.centres / np.where(size > 0, size, 1.0), np.eye(1, self.centres.shape[1]))
 
-    def draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
+    def draw(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "{count} d"]:
         """Return `count` points (count, d) drawn with `rng`."""
         components = rng.choice(len(self.weights), size=count, p=self.weights)
         x, u, s = (
@@ -153,11 +155,11 @@ class Mixture(NamedTuple):
         )
         return self.centres[components] + s[:, None] * x + ((1 - s) * np.sum(u * x, axis=1))[:, None] * u
 
-    def log_weight(self, z: np.ndarray) -> np.ndarray:
+    def log_weight(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         """Return log(phi/q) at `z` (n, d), shape (n,)."""
         return -np.logaddexp.reduce(self._terms(z)[0], axis=1)
 
-    def parts(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def parts(self, z: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
         """Return each centre's share of the density at `z` (n, d), and the squared distance from its line, each (n, k).
 
         The share is the probability that z was drawn around that centre. The line passes through the origin and the
@@ -167,7 +169,7 @@ class Mixture(NamedTuple):
         odds = np.exp(terms - np.max(terms, axis=1, keepdims=True))
         return odds / np.sum(odds, axis=1, keepdims=True), across
 
-    def _terms(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _terms(self, z: Float[np.ndarray, "n d"]) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
         """Return log(weight * density/phi) of each centre, and squared distances from its line, each (n, k)."""
         along, square = z @ self.directions.T, np.sum(z**2, axis=1)[:, None]
         across, size = np.maximum(square - along**2, 0.0), np.linalg.norm(self.centres, axis=1)
@@ -177,7 +179,10 @@ class Mixture(NamedTuple):
 
 
 def fit_proposal(
-    failures: np.ndarray, group: np.ndarray, probability: float, centres: np.ndarray | None = None
+    failures: Float[np.ndarray, "n d"],
+    group: Int[np.ndarray, " n"],
+    probability: float,
+    centres: Float[np.ndarray, "k d"] | None = None,
 ) -> tuple[Mixture, float]:
     """Return the fitted mixture with the least predicted moment E_q[w^2 1_F]/P^2, and the logarithm of the moment.
 
@@ -203,7 +208,7 @@ def fit_proposal(
     return fits[best](failures), float(moments[best])
 
 
-def _second_moment(fit: Fit, failures: np.ndarray, odd: np.ndarray) -> float:
+def _second_moment(fit: Fit, failures: Float[np.ndarray, "n d"], odd: Bool[np.ndarray, " n"]) -> float:
     """Return log E[w|F], with each half of the failures evaluated under the mixture fitted to the other half."""
     halves = failures[odd], failures[~odd]
     if min(map(len, halves)) == 0:
@@ -212,7 +217,7 @@ def _second_moment(fit: Fit, failures: np.ndarray, odd: np.ndarray) -> float:
     return np.logaddexp.reduce(np.concatenate(logs)) - np.log(len(failures))
 
 
-def _fit_mixture(z: np.ndarray, centres: np.ndarray, *, moving: bool) -> Mixture:
+def _fit_mixture(z: Float[np.ndarray, "n d"], centres: Float[np.ndarray, "k d"], *, moving: bool) -> Mixture:
     """Return the mixture with weights and scales of maximum likelihood, and fitted centres if `moving`."""
     count, d = len(centres), z.shape[1]
     mixture = Mixture(centres, np.full(count, 1 / count), np.ones(count))
@@ -229,7 +234,7 @@ def _fit_mixture(z: np.ndarray, centres: np.ndarray, *, moving: bool) -> Mixture
     return mixture
 
 
-def choose_spread_points(z: np.ndarray, count: int) -> np.ndarray:
+def choose_spread_points(z: Float[np.ndarray, "n d"], count: int) -> Float[np.ndarray, "k d"]:
     """Return up to `count` of the points, far apart in direction; the first is the point nearest to the origin.
 
     Each further point has the direction farthest from the directions chosen so far.
@@ -244,7 +249,7 @@ def choose_spread_points(z: np.ndarray, count: int) -> np.ndarray:
     return z[indices]
 
 
-def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> np.ndarray:
+def design_points(gradient: Gradient, starts: Float[np.ndarray, "n d"], threshold: float) -> Float[np.ndarray, "k d"]:
     """Return local minima (k, d) of |z| on g(z) = threshold, the nearest to the origin first.
 
         z' = (a'z + threshold - g) a/|a|^2,   a = dg/dz
@@ -285,8 +290,8 @@ def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> n
 
 def try_importance_sampling(
     runs: CountedScore,
-    failures: np.ndarray,
-    group: np.ndarray,
+    failures: Float[np.ndarray, "n d"],
+    group: Int[np.ndarray, " n"],
     subset: ProbabilityEstimate,
     *,
     threshold: float,

@@ -38,6 +38,7 @@ import numpy as np
 
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.kinds import find_value_objection, format_value
+from diffabs.core.shapes import Bool, Float, Int
 from diffabs.core.types import PyTree
 from diffabs.uncertainty.reliability.importance_sampling import (
     CountedScore,
@@ -302,9 +303,9 @@ class _Population(NamedTuple):
     `family` is the index of the first-level sample from which each sample descends.
     """
 
-    z: np.ndarray
-    scores: np.ndarray
-    family: np.ndarray
+    z: Float[np.ndarray, "n d"]
+    scores: Float[np.ndarray, " n"]
+    family: Int[np.ndarray, " n"]
     length: int
     acceptance: float
     spread: float
@@ -318,7 +319,7 @@ class _LevelSequence(NamedTuple):
 
     levels: list[SubsetLevel]
     last: _Population
-    hits: np.ndarray
+    hits: Bool[np.ndarray, " n"]
     reason: SubsetReason
     failed: int
 
@@ -346,7 +347,7 @@ def _run_levels(
         now = _advance_chains(runs, now, hits, value, plan, rng)
 
 
-def _next_threshold(scores: np.ndarray, plan: _Plan) -> float | None:
+def _next_threshold(scores: Float[np.ndarray, " n"], plan: _Plan) -> float | None:
     """Return the next threshold b_j, or None if all samples share one score.
 
     It is the final threshold if at least half as many samples as there are chains fail. Another level would cost more
@@ -388,7 +389,7 @@ def _advance_chains(
     )
 
 
-def _level_cov(hits: np.ndarray) -> float:
+def _level_cov(hits: Bool[np.ndarray, "steps chains"]) -> float:
     """Return the coefficient of variation of a level's share from hits (length, chains).
 
         sqrt((1 - p)/(p n) (1 + 2 sum_k (1 - k/length) correlation_k))
@@ -412,7 +413,7 @@ def _plain_estimate(failed: int, samples: int) -> ProbabilityEstimate:
     return ProbabilityEstimate(share, math.sqrt((1 - share) / failed), (low, high))
 
 
-def _product_estimate(levels: list[SubsetLevel], family: np.ndarray) -> ProbabilityEstimate:
+def _product_estimate(levels: list[SubsetLevel], family: Int[np.ndarray, " n"]) -> ProbabilityEstimate:
     """Return the product of the shares, with the variance estimated from the families of the failures."""
     covs = np.array([level.cov for level in levels])
     parts = np.bincount(family) / len(family)

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from diffabs.core.optional import import_optional
+from diffabs.core.shapes import Bool, Shaped
 from diffabs.core.summary import Summary
 from diffabs.core.types import JsonObject, PyTree, Scalar
 from diffabs.host import files
@@ -132,7 +133,7 @@ class Results:
         """SHA-256 over the contents of all chunks in order; equal for equal tables with chunks of one size."""
         return seal.tables_digest(self._read_table(chunk, None) for chunk in sorted(self.files))
 
-    def failures(self) -> dict[str, np.ndarray]:
+    def failures(self) -> dict[str, Bool[np.ndarray, " runs"]]:
         """Return which samples failed, as {kind: mask}, each of shape (samples,).
 
         The kinds are "diverged", a wrong end ("stopped" or "not stopped"), and "METRIC > BOUND". A sample may have
@@ -140,7 +141,7 @@ class Results:
         """
         return failure_masks(self.column, self.study["failures"], self.study["success"])
 
-    def failed_samples(self) -> np.ndarray:
+    def failed_samples(self) -> Bool[np.ndarray, " runs"]:
         """Return which samples failed, of any kind, shape (samples,)."""
         return np.any(list(self.failures().values()), axis=0)
 
@@ -156,7 +157,7 @@ class Results:
                 raise unknown_name_error(f"{name} is no column of {self.folder}", name, available)
         return pa.concat_tables([self._read_table(chunk, names) for chunk in sorted(self.files)]).unify_dictionaries()
 
-    def column(self, name: str) -> np.ndarray:
+    def column(self, name: str) -> Shaped[np.ndarray, " runs"]:
         """Return the column `name` in the order of the samples, shape (samples,).
 
         Raises:
@@ -187,7 +188,7 @@ class Results:
         return data
 
     @property
-    def accepted(self) -> np.ndarray:
+    def accepted(self) -> Bool[np.ndarray, " runs"]:
         """Mask of the samples that were run, in their order, shape (samples,)."""
         return is_accepted(self.column("refused"))
 

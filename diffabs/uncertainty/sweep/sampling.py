@@ -12,12 +12,13 @@ import dataclasses
 import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.shapes import Float, UInt
 from diffabs.core.types import PyTree, Table
 from diffabs.host.values import (
     check_sound,
@@ -38,12 +39,13 @@ from diffabs.uncertainty.sweep.distributions import support_interval
 MAX_UINT32 = 2**32 - 1
 MAX_HYPERCUBE_SAMPLES = 1_000_000  # a Latin hypercube is drawn and kept as a whole
 SOBOL_BITS = 32
+Points: TypeAlias = Float[np.ndarray, "runs variables"]  # in the unit cube
 
 
 class SamplingDesign(Protocol):
     """A rule by which samples fill the unit cube."""
 
-    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> Points:
         """Return samples start, ..., stop - 1, shape (stop - start, dimension).
 
         They lie in (0, 1), those of grids and corners in [0, 1]. `seed` selects the points of a random design;
@@ -70,7 +72,7 @@ class SamplingDesign(Protocol):
 class Random(SamplingDesign):
     """Independent samples: bits of JAX's `fold_in(key(seed), i)` (Threefry), 52 to a number."""
 
-    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> Points:
         del samples
         high, low = np.moveaxis(
             np.asarray(_random_words(_check_seed(seed), np.uint32(start), stop - start, dimension)), -1, 0
@@ -80,7 +82,7 @@ class Random(SamplingDesign):
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
-def _random_words(seed: Any, start: PyTree, count: int, dimension: int) -> jax.Array:
+def _random_words(seed: Any, start: PyTree, count: int, dimension: int) -> UInt[jax.Array, "{count} variables 2"]:
     key = jax.random.key(seed, impl="threefry2x32")
     numbers = start + jax.lax.iota(jnp.uint32, count)
     return jax.vmap(lambda i: jax.random.bits(jax.random.fold_in(key, i), (dimension, 2), jnp.uint32))(numbers)
@@ -97,7 +99,7 @@ class Sobol(SamplingDesign):
 
     replicates: int = table_field(whole_reader(1, MAX_UINT32), 1)
 
-    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> Points:
         block = samples // self.replicates
         points = [np.empty((0, dimension))]
         for r in range(start // block, math.ceil(stop / block)):
@@ -110,7 +112,7 @@ class Sobol(SamplingDesign):
         return _check_multiple(super().count(variables, samples), self.replicates, "the number of replicates")
 
 
-def _sobol_points(seed: int, replicate: int, start: int, stop: int, dimension: int) -> np.ndarray:
+def _sobol_points(seed: int, replicate: int, start: int, stop: int, dimension: int) -> Points:
     """Return points of one scrambled sequence, moved by half of their last bit. Skipping 10^7 points takes 0.1 s."""
     from scipy.stats import qmc
 
@@ -130,7 +132,7 @@ class LatinHypercube(SamplingDesign):
     All samples are drawn and kept together.
     """
 
-    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> Points:
         return _hypercube_points(seed, samples, dimension)[start:stop]
 
     def count(self, variables: Table, samples: int | None) -> int:
@@ -143,7 +145,7 @@ class LatinHypercube(SamplingDesign):
 
 
 @functools.lru_cache(1)
-def _hypercube_points(seed: int, samples: int, dimension: int) -> np.ndarray:
+def _hypercube_points(seed: int, samples: int, dimension: int) -> Float[np.ndarray, "{samples} {dimension}"]:
     from scipy.stats import qmc
 
     points = qmc.LatinHypercube(dimension, rng=_generator(seed, 0)).random(samples)
@@ -188,7 +190,7 @@ class Grid(SamplingDesign):
         levels = self.levels.get(name, 0) if isinstance(self.levels, Mapping) else self.levels
         return tuple(variable.middles()) if hasattr(variable, "middles") and np.ndim(levels) == 0 else levels
 
-    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> Points:
         """Return samples of a grid made by `over`, or of a grid with one number of levels for all variables."""
         del seed, samples
         all_levels = list(self.levels.values()) if isinstance(self.levels, Mapping) else [self.levels] * dimension
@@ -243,7 +245,7 @@ def _levels_at(places: np.ndarray, levels: int | Sequence[float]) -> np.ndarray:
 class Corners(SamplingDesign):
     """The 2^d corners of the box of supports; the last variable changes fastest."""
 
-    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> Points:
         return Grid(2).unit(seed, start, stop, dimension, samples)
 
     def count(self, variables: Table, samples: int | None) -> int:
@@ -272,7 +274,7 @@ class Saltelli(SamplingDesign):
     Source: Saltelli et al. 2010, Computer Physics Communications 181, 259.
     """
 
-    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> Points:
         del samples
         row, member = np.divmod(np.arange(start, stop), dimension + 2)
         first, last = start // (dimension + 2), math.ceil(stop / (dimension + 2))
