@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from numpy.typing import ArrayLike
 
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.shapes import Float, Num
-from diffabs.core.types import AnyArray, Array, PyTree
+from diffabs.core.types import AnyArray, Array, PyTree, Rows
 
 MAX_SMITH_STEPS = 50  # C^(2^50) is 0 for a spectral radius of 1 - 1e-13, and not for a radius of 1
 
@@ -78,7 +77,7 @@ def _solve_vectorised(operator: jax.Array, Q: Array) -> jax.Array:
     return jnp.linalg.solve(operator, -Q.ravel()).reshape(Q.shape)
 
 
-def as_float_arrays(*values: ArrayLike) -> tuple[Array, ...]:
+def as_float_arrays(*values: AnyArray | Rows) -> tuple[Array, ...]:
     """Return the arguments as arrays of one common floating-point type."""
     values = tuple(jnp.asarray(x) if isinstance(x, list | tuple) else x for x in values)
     kind = jnp.result_type(float, *values)

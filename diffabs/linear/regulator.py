@@ -13,7 +13,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from numpy.typing import ArrayLike
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.jax_flags import default_flags
@@ -155,7 +154,13 @@ def _solve_dlqr(
 
 
 def _check_matrices(
-    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, S: ArrayLike | None, *, discrete: bool
+    A: AnyArray | Rows,
+    B: AnyArray | Rows,
+    Q: AnyArray | Rows,
+    R: AnyArray | Rows,
+    S: AnyArray | Rows | None,
+    *,
+    discrete: bool,
 ) -> None:
     """Raise ValueError for matrices of numbers that have no regulator; accept traced ones."""
     if any(isinstance(x, Tracer) for x in (A, B, Q, R)):

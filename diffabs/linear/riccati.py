@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from numpy.typing import ArrayLike
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.jax_flags import default_flags
@@ -150,7 +149,9 @@ def symmetric_part(X: AnyArray) -> AnyArray:
     return (X + X.T) / 2
 
 
-def _riccati(solution: Callable, A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, S: Any) -> Riccati:
+def _riccati(
+    solution: Callable, A: AnyArray | Rows, B: AnyArray | Rows, Q: AnyArray | Rows, R: AnyArray | Rows, S: Any
+) -> Riccati:
     A, B, Q, R = as_float_arrays(A, B, Q, R)
     S = jnp.zeros_like(B) if S is None else as_float_arrays(S)[0].astype(B.dtype)
     if jnp.iscomplexobj(B) or jnp.iscomplexobj(S):

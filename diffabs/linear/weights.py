@@ -1,7 +1,6 @@
 """Weights of a quadratic cost."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 SYMMETRY_TOLERANCE = 1e-12  # difference of X[i, j] and X[j, i] that is rounding, relative to the entry's size
 
@@ -24,17 +23,18 @@ def check_symmetric(name: str, value: object, size: int) -> None:
         raise ValueError(f"{name} = {array.tolist()} is not symmetric and finite")
 
 
-def as_weight_matrix(name: str, value: ArrayLike, size: int, *, definite: bool) -> np.ndarray:
+def as_weight_matrix(name: str, value: object, size: int, *, definite: bool) -> np.ndarray:
     """Return a weight, a matrix, diagonal or (for size 1) number, as a symmetric (size, size) matrix.
 
     Args:
         definite: Whether the matrix must be positive definite; else semidefinite.
     """
     array = np.array(value, float)
+    shape = array.shape
     if array.ndim < 2:
         array = np.diag(np.atleast_1d(array))
     if array.shape != (size, size):
-        raise ValueError(f"{name} has shape {np.shape(value)}; it needs ({size}, {size}), or its diagonal ({size},)")
+        raise ValueError(f"{name} has shape {shape}; it needs ({size}, {size}), or its diagonal ({size},)")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} = {array.tolist()} has an entry that is not finite")
     if not is_symmetric(array):

@@ -56,7 +56,7 @@ def attacked(attack: Attack, config: Searching, seeds: tuple[int, ...], budget: 
 
 
 def hardened(
-    attack: Attack, config: Rounds, searching: Searching, price: float, told: Callable[[str], None]
+    attack: Attack, config: Rounds, searching: Searching, price: float, report: Callable[[str], None]
 ) -> tuple[list[Loop], np.ndarray]:
     """Return the loop before the first round and after each, and all worst points (n, size)."""
     bounds, loops = attack.bounds, [attack.loop]
@@ -69,7 +69,7 @@ def hardened(
         lanes[config.box + count : config.box + count + len(found)] = found
         count += len(found)
         loops.append(_tuned(loops[-1], bounds, config, attack, lanes))
-        told(f"round {number}: {_said(loops[-1])}")
+        report(f"round {number}: {_said(loops[-1])}")
     return loops, lanes[config.box : config.box + count]
 
 

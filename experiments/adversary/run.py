@@ -50,14 +50,14 @@ class Config:
     out: str = "out/experiments/adversary"
 
 
-def searched(attack: Attack, config: Config, told: Callable[[str], None]) -> tuple[float, dict[str, Log]]:
+def searched(attack: Attack, config: Config, report: Callable[[str], None]) -> tuple[float, dict[str, Log]]:
     """Return the price of a gradient and the log of each search."""
     price = config.searching.priced(attack)
-    told(f"a gradient costs {price:.1f} runs")
+    report(f"a gradient costs {price:.1f} runs")
     logs = {}
     for name, search in SEARCHES.items():
         logs[name] = search(attack, config.searching, price)
-        told(f"{name}: overshoot [%] {np.round(100 * logs[name].overshoots, 3).tolist()}")
+        report(f"{name}: overshoot [%] {np.round(100 * logs[name].overshoots, 3).tolist()}")
     return price, logs
 
 
@@ -118,10 +118,10 @@ def checked(attack: Attack, config: Config, z: np.ndarray) -> dict[str, Any]:
     }
 
 
-def against(name: str, attack: Attack, config: Config, told: Callable[[str], None]) -> tuple[dict[str, Log], Any]:
+def against(name: str, attack: Attack, config: Config, report: Callable[[str], None]) -> tuple[dict[str, Log], Any]:
     """Return everything about one controller."""
     at_rest = float(attack.overshoots(nominal(config.bounds))[0])
-    price, logs = searched(attack, config, lambda line: told(f"{name}, {line}"))
+    price, logs = searched(attack, config, lambda line: report(f"{name}, {line}"))
     rows, z = excesses(config, logs, at_rest), worst_of(logs, GRADIENTS)
     record.print_rows(f"{name}: nominal overshoot {100 * at_rest:.2f} %, excess [%] at equal cost", rows)
     return logs, {
@@ -135,7 +135,7 @@ def against(name: str, attack: Attack, config: Config, told: Callable[[str], Non
     }
 
 
-def in_more_dimensions(config: Config, told: Callable[[str], None]) -> list[dict[str, Any]]:
+def in_more_dimensions(config: Config, report: Callable[[str], None]) -> list[dict[str, Any]]:
     """Return gradients and CMA-ES against the tuned controller with many more numbers of road and noise.
 
     Nothing of this was fixed beforehand. A kernel does not take so many numbers that differ between lanes, so XLA makes
@@ -149,18 +149,18 @@ def in_more_dimensions(config: Config, told: Callable[[str], None]) -> list[dict
     marks = tuple(mark for mark in config.marks if mark <= config.finer_budget)
     rows = excesses(dataclasses.replace(config, marks=marks), logs, at_rest)
     record.print_rows(f"{TUNED}, {bounds.size} numbers, a gradient {price:.1f} runs: excess [%]", rows)
-    told(f"{bounds.size} numbers")
+    report(f"{bounds.size} numbers")
     return [{"numbers": bounds.size, "price of a gradient": price, **row} for row in rows]
 
 
-def tuned_against(attack: Attack, config: Config, price: float, told: Callable[[str], None]) -> dict[str, Any]:
+def tuned_against(attack: Attack, config: Config, price: float, report: Callable[[str], None]) -> dict[str, Any]:
     """Return the rounds, and how each loop fares against fresh adversaries."""
-    loops, _ = hardened(attack, config.rounds, config.searching, price, told)
+    loops, _ = hardened(attack, config.rounds, config.searching, price, report)
     rows = []
     for number, loop in enumerate(loops):
         fares = judged(dataclasses.replace(attack, loop=loop), config.rounds, config.searching, price)
         rows.append({"rounds": number, **fares})
-        told(f"after {number} rounds: fresh adversaries {fares['fresh adversaries, median [%]']:.2f} %")
+        report(f"after {number} rounds: fresh adversaries {fares['fresh adversaries, median [%]']:.2f} %")
     record.print_rows("Tuned against the adversary", rows)
     last: Any = loops[-1]
     c, r = last.controller.controller, last.reference

@@ -43,26 +43,26 @@ class Config:
     out: str = "out/experiments/best_slip"
 
 
-def judged(config: Config, one: Loop, batch: Batch, finer: int = 1) -> Metrics:
+def judged(config: Config, loop: Loop, batch: Batch, finer: int = 1) -> Metrics:
     """Metrics of every lane, with so many times shorter steps."""
     solver = FixedStep(step=config.fixed.step / finer, duration=config.fixed.longest)
-    done = jax.device_get(run_batch(one, batch, solver, MEASURED, engine="kernel"))
-    return {**done.metrics, "stopped": done.stopped, "diverged": done.diverged}
+    runs = jax.device_get(run_batch(loop, batch, solver, MEASURED, engine="kernel"))
+    return {**runs.metrics, "stopped": runs.stopped, "diverged": runs.diverged}
 
 
 def contenders(config: Config, sensors: str, unseen: Lanes, own: dict[str, Loop]) -> dict[str, tuple[Loop, Batch]]:
     """Return loops and lanes: untuned, tuned, and with known roads under the controller of the fixed slip."""
     batch = unseen.batch(sensors)
-    seen = start(config.ranges, config.fixed, sensors, FIXED).sensor
-    those = {name: (one, batch) for name, one in untuned(config.ranges, config.fixed, sensors)}
-    those |= {name: (dataclasses.replace(one, sensor=seen), batch) for name, one in own.items()}
-    return those | {KNOWN: told_the_peak(config.fixed, sensors, own[FIXED].controller, unseen)}
+    sensor = start(config.ranges, config.fixed, sensors, FIXED).sensor
+    cases = {name: (loop, batch) for name, loop in untuned(config.ranges, config.fixed, sensors)}
+    cases |= {name: (dataclasses.replace(loop, sensor=sensor), batch) for name, loop in own.items()}
+    return cases | {KNOWN: told_the_peak(config.fixed, sensors, own[FIXED].controller, unseen)}
 
 
-def by_road(name: str, found: Metrics, unseen: Lanes) -> dict[str, Any]:
+def by_road(name: str, metrics: Metrics, unseen: Lanes) -> dict[str, Any]:
     """Return means above the bound [%] on kinds of roads, with and without a stop that attains the bound."""
-    bound, mine = unseen.bound, good(found)
-    excess = 100 * (found["stop_distance"] / bound.distance - 1)
+    bound, ended = unseen.bound, good(metrics)
+    excess = 100 * (metrics["stop_distance"] / bound.distance - 1)
     level = unseen.family.values["plant.road.roads.0.D"]
     kinds = {
         "one surface": bound.attained,
@@ -72,7 +72,7 @@ def by_road(name: str, found: Metrics, unseen: Lanes) -> dict[str, Any]:
         "with an edge, to more": ~bound.attained & ~_falls(unseen),
     }
     means = {
-        kind: float(np.mean(excess[lanes & mine])) if np.any(lanes & mine) else None for kind, lanes in kinds.items()
+        kind: float(np.mean(excess[lanes & ended])) if np.any(lanes & ended) else None for kind, lanes in kinds.items()
     }
     return {"rule": name, **means}
 
@@ -82,40 +82,40 @@ def _falls(unseen: Lanes) -> np.ndarray:
     return values["plant.road.roads.1.D"] < values["plant.road.roads.0.D"]
 
 
-def halved(config: Config, one: Loop, batch: Batch, found: Metrics, shortest: np.ndarray) -> dict[str, Any]:
+def halved(config: Config, loop: Loop, batch: Batch, metrics: Metrics, shortest: np.ndarray) -> dict[str, Any]:
     """By how much the mean above the bound changes [%] if steps are half as long; lanes that end otherwise."""
-    again = judged(config, one, batch, finer=2)
-    both = good(found) & good(again)
-    change = (again["stop_distance"] - found["stop_distance"])[both] / shortest[both]
+    again = judged(config, loop, batch, finer=2)
+    both = good(metrics) & good(again)
+    change = (again["stop_distance"] - metrics["stop_distance"])[both] / shortest[both]
     return {
         "mean change [%]": 100 * float(np.mean(change)) if both.any() else None,
-        "lanes that end otherwise": int(np.sum(good(found) != good(again))),
+        "lanes that end otherwise": int(np.sum(good(metrics) != good(again))),
     }
 
 
 def of_sensors(
-    config: Config, sensors: str, told: Callable[[str], None], carried: dict[str, Loop]
+    config: Config, sensors: str, report: Callable[[str], None], carried: dict[str, Loop]
 ) -> tuple[dict[str, Any], dict[str, Metrics], dict[str, Loop]]:
     """Tune, judge and check the rules for these sensors. Returns the results, the metrics of every lane, and the
     loops by rule."""
     fixed, found = config.fixed, {}
     for rule in config.rules[sensors]:
         found[rule] = tuned(config.search, fixed, sensors, rule, config.ranges)
-        told(f"{sensors}, {rule}: {found[rule].tuned.objective[1]:.5f}")
+        report(f"{sensors}, {rule}: {found[rule].tuned.objective[1]:.5f}")
     own = carried | {rule: one.loop for rule, one in found.items()}
     unseen = lanes(fixed, fixed.roads.held_out, fixed.roads.seed + 1)
     shortest = unseen.bound.distance
     those = contenders(config, sensors, unseen, own)
     results = {name: judged(config, *one) for name, one in those.items()}
-    told(f"{sensors}: judged")
+    report(f"{sensors}: judged")
     named = {n: (f"tuned, {n}" if n in found else f"tuned for {EXACT}, {n}") if n in own else n for n in results}
     checks = {named[name]: halved(config, *those[name], results[name], shortest) for name in (PAPER, *own)}
-    told(f"{sensors}: halved")
+    report(f"{sensors}: halved")
     slopes = {
         rule: against_differences(config.search, fixed, sensors, rule, config.ranges, one.loop)
         for rule, one in found.items()
     }
-    told(f"{sensors}: differences")
+    report(f"{sensors}: differences")
     said = {
         "table": [{"rule": named[n], **line(fixed, one, results[PAPER], shortest)} for n, one in results.items()],
         "by road": [by_road(named[name], one, unseen) for name, one in results.items()],
@@ -162,17 +162,17 @@ def figure(config: Config, results: dict[str, dict[str, Metrics]], shortest: np.
 def main(config: Config | None = None, progress: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config, begun = config or Config(), time.process_time()
-    said, results, own = {}, {}, {}
+    tables, results, own = {}, {}, {}
     for sensors in config.rules:
-        said[sensors], results[sensors], own = of_sensors(config, sensors, progress, own)
+        tables[sensors], results[sensors], own = of_sensors(config, sensors, progress, own)
         count = config.fixed.roads.held_out
         record.print_rows(
-            f"{sensors}: {count} roads, intervals of {config.fixed.confidence:.0%}", said[sensors]["table"]
+            f"{sensors}: {count} roads, intervals of {config.fixed.confidence:.0%}", tables[sensors]["table"]
         )
-        record.print_rows(f"{sensors}: means above the bound [%] by kind of road", said[sensors]["by road"])
+        record.print_rows(f"{sensors}: means above the bound [%] by kind of road", tables[sensors]["by road"])
     again = {rule: by_cma_es(config.search, config.fixed, EXACT, rule, config.ranges) for rule in config.searched_again}
     shortest = lanes(config.fixed, config.fixed.roads.held_out, config.fixed.roads.seed + 1).bound.distance
-    whole = {**said, "bound": of_bounds(config.fixed), "CMA-ES, exact sensors": again}
+    whole = {**tables, "bound": of_bounds(config.fixed), "CMA-ES, exact sensors": again}
     whole["seconds of processor time"] = time.process_time() - begun
     return record.experiment(config, whole, {"roads": figure(config, results, shortest)})
 

@@ -106,10 +106,10 @@ def described(found: Found) -> dict[str, Any]:
     }
 
 
-def problem(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, one: Loop) -> Problem:
+def problem(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, loop: Loop) -> Problem:
     """The tuning's problem on all of its roads, around a loop."""
     known = lanes(fixed, search.roads, fixed.roads.seed)
-    return build_problem(one, **task(search, fixed, sensors, rule, ranges, known))
+    return build_problem(loop, **task(search, fixed, sensors, rule, ranges, known))
 
 
 def by_cma_es(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges) -> dict[str, Any]:
@@ -131,7 +131,7 @@ def by_cma_es(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ran
 
 
 def against_differences(
-    search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, one: Loop
+    search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, loop: Loop
 ) -> dict[str, Any]:
     """Return on how many lanes central differences agree with the derivative at the end of a search.
 
@@ -141,13 +141,13 @@ def against_differences(
     """
     known = lanes(fixed, search.roads, fixed.roads.seed)
     given = task(search, fixed, sensors, rule, ranges, known)
-    coordinates, solver = parameter_space(one, given["free"]), dataclasses.replace(given["solver"], kinks=True)
-    z = np.asarray(coordinates.place(one))
+    coordinates, solver = parameter_space(loop, given["free"]), dataclasses.replace(given["solver"], kinks=True)
+    z = np.asarray(coordinates.place(loop))
     way = np.random.default_rng(search.seed).normal(size=len(z))
     way /= np.linalg.norm(way)
 
     def ratios(z: Any) -> Any:
-        run = run_batch(coordinates.at(one, z), given["over"], solver, MEASURED, engine="kernel")
+        run = run_batch(coordinates.at(loop, z), given["over"], solver, MEASURED, engine="kernel")
         return run.metrics["stop_distance"] / known.bound.distance
 
     along = jax.jit(lambda z: jax.jvp(ratios, (z,), (jnp.asarray(way),)))

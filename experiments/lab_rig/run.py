@@ -29,6 +29,7 @@ from diffabs.parts.plants.lab_rig import LabRigState
 from diffabs.parts.references import FixedSlip
 from diffabs.parts.stops import SpeedReached
 from diffabs.scenario.defaults import braking
+from experiments._shared.numbers import store_numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,4 +215,4 @@ def main(config: Config | None = None) -> dict[str, Any]:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main()
+    store_numbers(__file__, main())

@@ -57,8 +57,8 @@ def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
     mode = min(prices, key=lambda mode: prices[mode])
     most = config.iterations[large]
     stopping = Stopping(gradient=1e-9, change=1e-11, iterations=most)
-    found = tune(pose(mode=mode), method=Method(memory=searches.MEMORY, stopping=stopping))
-    print(f"{name}: tune {found.objective[1]:.9g}, {found.evaluations} gradients; {found.reason.value}", flush=True)
+    tuning = tune(pose(mode=mode), method=Method(memory=searches.MEMORY, stopping=stopping))
+    print(f"{name}: tune {tuning.objective[1]:.9g}, {tuning.evaluations} gradients; {tuning.reason.value}", flush=True)
     budget = allowed(config, problem.space.size)
     asked: dict[str, Callable[[], searches.Trace]] = {
         GRADIENTS: lambda: searches.gradients(problem, mode, most),
@@ -69,7 +69,7 @@ def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
             for first in config.first_steps
         },
     }
-    traces = {TUNE: [(float(p.evaluations), p.objective) for p in found.history]}
+    traces = {TUNE: [(float(p.evaluations), p.objective) for p in tuning.history]}
     for who, search in asked.items():
         traces[who] = search()
         print(f"{name}: {who} {traces[who][-1]}", flush=True)
@@ -79,12 +79,12 @@ def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
         "lanes": problem.batch.size,
         "prices": {m.value: p for m, p in prices.items()},
         "price": prices[mode],
-        "start": found.objective[0],
+        "start": tuning.objective[0],
         "found": {who: trace[-1][1] for who, trace in traces.items()},
         "spent": {who: trace[-1][0] for who, trace in traces.items()},
         "traces": traces,
-        "values": {path: np.asarray(value).tolist() for path, value in found.values.items()},
-    }, found
+        "values": {path: np.asarray(value).tolist() for path, value in tuning.values.items()},
+    }, tuning
 
 
 def lines(config: Config, kept: dict[str, Any]) -> list[dict[str, Any]]:
@@ -93,27 +93,27 @@ def lines(config: Config, kept: dict[str, Any]) -> list[dict[str, Any]]:
     return [line(kept, f"{near:g}", best + near * (start - best)) for near in config.near]
 
 
-def line(kept: dict[str, Any], accuracy: str, target: float) -> dict[str, Any]:
+def line(problem: dict[str, Any], accuracy: str, target: float) -> dict[str, Any]:
     """Return the rollouts to a target; None if a search does not reach it.
 
     A ratio is None if gradients did not reach the accuracy. If the search without gradients did not, the ratio is a
     lower bound, from all its rollouts.
     """
-    counts = {who: searches.needed(trace, target) for who, trace in kept["traces"].items()}
-    rollouts = {who: n * kept["price"] if who in WITH else n for who, n in counts.items()}
+    counts = {who: searches.needed(trace, target) for who, trace in problem["traces"].items()}
+    rollouts = {who: n * problem["price"] if who in WITH else n for who, n in counts.items()}
     tuned = [who for who in counts if who.startswith(CMA_ES)]
-    best = min(tuned, key=lambda who: (rollouts[who], kept["found"][who]))
+    best = min(tuned, key=lambda who: (rollouts[who], problem["found"][who]))
 
     def fewer(other: str) -> float | None:
-        theirs = rollouts[other] if np.isfinite(rollouts[other]) else kept["spent"][other]
+        theirs = rollouts[other] if np.isfinite(rollouts[other]) else problem["spent"][other]
         return theirs / rollouts[GRADIENTS] if np.isfinite(rollouts[GRADIENTS]) else None
 
     shown = {who: rollouts[who] for who in (TUNE, GRADIENTS, DIFFERENCES, NELDER_MEAD)} | {CMA_ES: rollouts[best]}
     return {
-        "problem": kept["problem"],
-        "parameters": kept["parameters"],
+        "problem": problem["problem"],
+        "parameters": problem["parameters"],
         "accuracy": accuracy,
-        "price": kept["price"],
+        "price": problem["price"],
         "gradients": int(counts[GRADIENTS]) if np.isfinite(counts[GRADIENTS]) else None,
         **{who: round(n) if np.isfinite(n) else None for who, n in shown.items()},
         "best of CMA-ES": best.removeprefix(f"{CMA_ES}, "),
@@ -122,22 +122,24 @@ def line(kept: dict[str, Any], accuracy: str, target: float) -> dict[str, Any]:
     }
 
 
-def gains(config: Config, found: dict[str, Tuned]) -> list[dict[str, Any]]:
+def gains(config: Config, tunings: dict[str, Tuned]) -> list[dict[str, Any]]:
     """Return the final gain of each problem on the rig, its metrics, and its certificate without the lag."""
     rows = []
-    for name, one in found.items():
-        if not isinstance(one.loop.controller, StateFeedback):
+    for name, tuning in tunings.items():
+        if not isinstance(tuning.loop.controller, StateFeedback):
             continue
-        gain = np.asarray(one.loop.controller.gain)
+        gain = np.asarray(tuning.loop.controller.gain)
         proof = certify(gain, box(config), fastest=True)
-        metrics = one.metrics[1]
+        metrics = tuning.metrics[1]
         rows.append(
             {
                 "tuned": name,
                 "k1": float(gain[0]),
                 "k2": float(gain[1]),
-                "Q": np.round(np.asarray(one.part.weights()[0]), 1).tolist() if isinstance(one.part, LQWeights) else "",
-                "objective": one.objective[1],
+                "Q": np.round(np.asarray(tuning.part.weights()[0]), 1).tolist()
+                if isinstance(tuning.part, LQWeights)
+                else "",
+                "objective": tuning.objective[1],
                 "worst overshoot [%]": 100 * float(metrics["overshoot"].max()),
                 "mean IAE [s]": float(metrics["iae"].mean()),
                 "common P": {True: "yes", False: "none", None: "undecided"}[proof.quadratically_stable],

@@ -16,6 +16,7 @@ from scipy import stats
 from diffabs.papers import record
 from diffabs.uncertainty.sweep.statistics import summary
 from diffabs.uncertainty.sweep.statistics.estimates import Moments
+from experiments._shared.numbers import store_numbers
 
 LAWS = {
     "log-normal, sigma 1.5": stats.lognorm(1.5),
@@ -73,4 +74,4 @@ def main(config: Config | None = None) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main()
+    store_numbers(__file__, main(), tolerance=1e-3)

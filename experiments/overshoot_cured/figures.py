@@ -18,10 +18,10 @@ PUBLISHED, CURE = "published gain", "the cure"
 MASSES, STARTS, UNTIL = 13, 7, 0.35  # s
 
 
-def seen(config: Any, one: Loop, mass: float, speed: float) -> Run:
+def seen(config: Any, loop: Loop, mass: float, speed: float) -> Run:
     """One run with its trajectory."""
     solver = FixedStep(step=config.step, duration=config.longer, every=4)
-    return rollout(replace(one, {"plant.mass": mass, "initial.speed": speed / KMH}), solver, BRAKING)
+    return rollout(replace(loop, {"plant.mass": mass, "initial.speed": speed / KMH}), solver, BRAKING)
 
 
 def figures(config: Any, found: Tuned, those: dict[str, tuple[Loop, str]]) -> dict[str, Any]:

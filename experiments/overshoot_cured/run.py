@@ -151,8 +151,8 @@ def lmi_gains(config: Config) -> np.ndarray:
     without lag and sampling."""
     low, high = (speed / KMH for speed in config.proved_speeds)
     system = polytope(SlipModel(slip=config.slip), {"plant.mass": config.mass, "speed": (low, high)})
-    found = (design(system, Spec(Q=weights, R=1.0)) for weights in itertools.product(*config.weights))
-    return np.array([answer.gain[0] for answer in found])
+    designs = (design(system, Spec(Q=weights, R=1.0)) for weights in itertools.product(*config.weights))
+    return np.array([answer.gain[0] for answer in designs])
 
 
 def best_lmi(config: Config, batch: Batch) -> tuple[float, float]:
@@ -169,13 +169,13 @@ def best_lmi(config: Config, batch: Batch) -> tuple[float, float]:
     return k1, k2
 
 
-def contenders(config: Config, found: Loop, lmi: tuple[float, float]) -> dict[str, tuple[Loop, str]]:
+def contenders(config: Config, cure: Loop, lmi: tuple[float, float]) -> dict[str, tuple[Loop, str]]:
     """Return the compared loops, and the kind of certificate of each.
 
     The last rows are the cure without one of its ingredients.
     """
-    k = np.asarray(found.controller.controller.gain)  # pyright: ignore[reportAttributeAccessIssue]
-    time_constant = float(found.reference.time_constant)  # pyright: ignore[reportAttributeAccessIssue]
+    k = np.asarray(cure.controller.controller.gain)  # pyright: ignore[reportAttributeAccessIssue]
+    time_constant = float(cure.reference.time_constant)  # pyright: ignore[reportAttributeAccessIssue]
     slowest = k * config.proved_speeds[0] / config.proved_speeds[1]
 
     def fixed(gain: Any, time_constant: float = 0.0) -> tuple[Loop, str]:
@@ -190,7 +190,7 @@ def contenders(config: Config, found: Loop, lmi: tuple[float, float]) -> dict[st
         "LMI, weights of least overshoot": fixed(lmi),
         "published gain, filter 35 ms": fixed(lmi_design.PUBLISHED_GAIN, 0.035),
         "K = [-121.8, -158.2]": fixed(lmi_design.GENTLE),
-        "the cure": (found, "proportional"),
+        "the cure": (cure, "proportional"),
         "the cure, as packaged": (load("slip-cured", integrated=False).loop, "proportional"),
         "before tuning": (start(config), "proportional"),
         "cure, filter left out": follows(k),
@@ -201,11 +201,11 @@ def contenders(config: Config, found: Loop, lmi: tuple[float, float]) -> dict[st
     }
 
 
-def judged(config: Config, one: Loop, system: Polytope, batch: Batch) -> tuple[dict[str, Any], Certificate]:
+def judged(config: Config, loop: Loop, system: Polytope, batch: Batch) -> tuple[dict[str, Any], Certificate]:
     """Return the worst metrics of the lanes that do not diverge, and the certificate of the gain."""
     solver = FixedStep(step=config.step, duration=config.duration)
-    runs = jax.device_get(jax.jit(lambda one: run_batch(one, batch, solver, BRAKING))(one))
-    proof = certify(feedback_gain(one, system.states), system, fastest=True)
+    runs = jax.device_get(jax.jit(lambda loop: run_batch(loop, batch, solver, BRAKING))(loop))
+    proof = certify(feedback_gain(loop, system.states), system, fastest=True)
     worst = {name: float(np.max(kept(values, ~runs.diverged))) for name, values in runs.metrics.items()}
     row = {
         "overshoot [%]": 100 * worst["overshoot"],
@@ -221,22 +221,24 @@ def judged(config: Config, one: Loop, system: Polytope, batch: Batch) -> tuple[d
     return row, proof
 
 
-def weak(config: Config, those: dict[str, tuple[Loop, str]]) -> list[dict[str, Any]]:
+def weak(config: Config, controllers: dict[str, tuple[Loop, str]]) -> list[dict[str, Any]]:
     """Return the worst overshoot of each controller under one deviation."""
     solver = FixedStep(step=config.step, duration=config.longer)
-    return [{"controller": n, **weak_spots(one, config.box, solver, config.seeds)} for n, (one, _) in those.items()]
+    return [
+        {"controller": n, **weak_spots(loop, config.box, solver, config.seeds)} for n, (loop, _) in controllers.items()
+    ]
 
 
-def asked(config: Config, one: Loop) -> dict[str, tuple[float, float]]:
+def asked(config: Config, loop: Loop) -> dict[str, tuple[float, float]]:
     """Return least and greatest torque that the controller commands [N m]; inside the limits the linear model holds."""
     solver = FixedStep(step=config.step, duration=config.longer)
     outside = dataclasses.replace(config.box, speeds=(config.drawn[-1][1],))
-    return {"in the box": torques(one, config.box, solver), "from 70 km/h": torques(one, outside, solver)}
+    return {"in the box": torques(loop, config.box, solver), "from 70 km/h": torques(loop, outside, solver)}
 
 
-def summary(config: Config, found: Tuned, proof: Certificate) -> dict[str, Any]:
+def summary(config: Config, tuning: Tuned, proof: Certificate) -> dict[str, Any]:
     """Return everything to simulate the cure again, and its certificate."""
-    plain = {path: np.asarray(value, float).tolist() for path, _, value in parameters(found.loop)}
+    plain = {path: np.asarray(value, float).tolist() for path, _, value in parameters(tuning.loop)}
     finite = {path: value for path, value in plain.items() if np.isfinite(value).all()}
     return {
         "controller": {
@@ -252,8 +254,8 @@ def summary(config: Config, found: Tuned, proof: Certificate) -> dict[str, Any]:
             "computing delay [s]": plain["controller.delay"],
         },
         "parameters": finite,
-        "reason": found.reason.value,
-        "evaluations": found.evaluations,
+        "reason": tuning.reason.value,
+        "evaluations": tuning.evaluations,
         "certificate": proof.summary(),
     }
 
@@ -262,26 +264,26 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config = config or Config()
     proved, batch = systems(config), Batch(config.box.lanes())
-    found = tuned(config, proved["proportional"], start(config), progress)
-    those = contenders(config, found.loop, best_lmi(config, batch))
+    tuning = tuned(config, proved["proportional"], start(config), progress)
+    controllers = contenders(config, tuning.loop, best_lmi(config, batch))
     rows, proofs = [], {}
-    for name, (one, kind) in those.items():
-        row, proofs[name] = judged(config, one, proved[kind], batch)
+    for name, (loop, kind) in controllers.items():
+        row, proofs[name] = judged(config, loop, proved[kind], batch)
         rows.append({"controller": name, **row})
     record.print_rows(
         f"Worst of {batch.size} masses and speeds, corners included: 0..9.03 N m, lag 1 ms, 1 kHz, tau* of 5.75 kg",
         rows,
     )
-    spots = weak(config, those)
+    spots = weak(config, controllers)
     record.print_rows("Weak spots: worst overshoot [%] over the same box where one thing is wrong", spots)
-    asked_for = asked(config, found.loop)
-    cure = {**summary(config, found, proofs["the cure"]), "torque asked for [N m]": asked_for}
+    asked_for = asked(config, tuning.loop)
+    cure = {**summary(config, tuning, proofs["the cure"]), "torque asked for [N m]": asked_for}
     wanted = [{"starts": name, "least": low, "greatest": high} for name, (low, high) in asked_for.items()]
     record.print_rows(
         f"Torque [N m] that the cure asks for; {config.torque[0]:g} to {config.torque[1]:g} is what it gets", wanted
     )
     results = {"table": rows, "weak_spots": spots, "cure": cure}
-    return record.experiment(config, results, figures(config, found, those))
+    return record.experiment(config, results, figures(config, tuning, controllers))
 
 
 if __name__ == "__main__":

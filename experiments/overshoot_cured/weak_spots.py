@@ -66,23 +66,23 @@ NOISE = 0.005  # standard deviation of the measured slip
 NOISY = f"slip noise {NOISE:g}"
 
 
-def lanes(box: Box, one: Loop, spot: Spot) -> dict[str, np.ndarray]:
+def lanes(box: Box, loop: Loop, spot: Spot) -> dict[str, np.ndarray]:
     """The box's lanes with one thing wrong."""
     if spot.speed is not None:
         box = dataclasses.replace(box, speeds=(spot.speed,))
-    found = box.lanes()
-    wrong = {path: factor * float(get(one, path)) for path, factor in spot.factors} | dict(spot.values)
-    return found | {path: np.full(len(found["plant.mass"]), value) for path, value in wrong.items()}
+    box_lanes = box.lanes()
+    wrong = {path: factor * float(get(loop, path)) for path, factor in spot.factors} | dict(spot.values)
+    return box_lanes | {path: np.full(len(box_lanes["plant.mass"]), value) for path, value in wrong.items()}
 
 
-def everything(box: Box, one: Loop) -> tuple[Batch, list[str]]:
+def everything(box: Box, loop: Loop) -> tuple[Batch, list[str]]:
     """All spots but noise as one batch, which is compiled once, and the name of each lane's spot."""
-    those = [lanes(box, one, spot) for spot in SPOTS]
-    paths = dict.fromkeys(path for each in those for path in each)
-    count = [len(each["plant.mass"]) for each in those]
+    spot_lanes = [lanes(box, loop, spot) for spot in SPOTS]
+    paths = dict.fromkeys(path for each in spot_lanes for path in each)
+    count = [len(each["plant.mass"]) for each in spot_lanes]
     columns = {
         path: np.concatenate(
-            [each.get(path, np.full(n, float(get(one, path)))) for each, n in zip(those, count, strict=True)]
+            [each.get(path, np.full(n, float(get(loop, path)))) for each, n in zip(spot_lanes, count, strict=True)]
         )
         for path in paths
     }
@@ -95,16 +95,16 @@ def noisy(box: Box, seeds: int) -> Batch:
     return Batch(columns, list(range(seeds)) * len(box.lanes()["plant.mass"]))
 
 
-def weak_spots(one: Loop, box: Box, solver: FixedStep, seeds: int = 4) -> dict[str, float | None]:
+def weak_spots(loop: Loop, box: Box, solver: FixedStep, seeds: int = 4) -> dict[str, float | None]:
     """Worst overshoot [%] by what goes wrong; None where a run diverges."""
-    scaled = dataclasses.replace(one, sensor=SpeedScale())
+    scaled = dataclasses.replace(loop, sensor=SpeedScale())
     batch, names = everything(box, scaled)
-    runs = jax.device_get(jax.jit(lambda one: run_batch(one, batch, solver, OVERSHOOT))(scaled))
-    found = {spot.name: _worst(runs, np.array(names) == spot.name) for spot in SPOTS}
-    shaken = dataclasses.replace(one, sensor=Noise(slip=NOISE, period=1e-3))
+    runs = jax.device_get(jax.jit(lambda loop: run_batch(loop, batch, solver, OVERSHOOT))(scaled))
+    worst = {spot.name: _worst(runs, np.array(names) == spot.name) for spot in SPOTS}
+    shaken = dataclasses.replace(loop, sensor=Noise(slip=NOISE, period=1e-3))
     drawn = noisy(box, seeds)
-    runs = jax.device_get(jax.jit(lambda one: run_batch(one, drawn, solver, OVERSHOOT))(shaken))
-    return {**found, NOISY: _worst(runs, np.full(drawn.size, True))}
+    runs = jax.device_get(jax.jit(lambda loop: run_batch(loop, drawn, solver, OVERSHOOT))(shaken))
+    return {**worst, NOISY: _worst(runs, np.full(drawn.size, True))}
 
 
 def _worst(runs: Any, lanes: np.ndarray) -> float | None:
@@ -113,21 +113,21 @@ def _worst(runs: Any, lanes: np.ndarray) -> float | None:
     return 100 * float(np.max(runs.metrics["overshoot"][lanes]))
 
 
-def unlimited(one: Loop) -> Loop:
+def unlimited(loop: Loop) -> Loop:
     """Return the same loop with its torque limits in the actuator.
 
     The limits do the same there, since there is no anti-windup. So the run shows the commanded torque.
     """
-    inner = one.controller.controller  # pyright: ignore[reportAttributeAccessIssue]
+    inner = loop.controller.controller  # pyright: ignore[reportAttributeAccessIssue]
     limits = Limits(low=inner.low, high=inner.high)
     free = dataclasses.replace(inner, low=-np.inf, high=np.inf)
-    controller = dataclasses.replace(one.controller, controller=free)  # pyright: ignore[reportArgumentType]
-    return dataclasses.replace(one, controller=controller, actuator=Series(blocks=(limits, one.actuator)))
+    controller = dataclasses.replace(loop.controller, controller=free)  # pyright: ignore[reportArgumentType]
+    return dataclasses.replace(loop, controller=controller, actuator=Series(blocks=(limits, loop.actuator)))
 
 
-def torques(one: Loop, box: Box, solver: FixedStep) -> tuple[float, float]:
+def torques(loop: Loop, box: Box, solver: FixedStep) -> tuple[float, float]:
     """Least and greatest torque asked for over the box [N m], before the limits."""
-    free = unlimited(one)
+    free = unlimited(loop)
     asked = jax.jit(jax.vmap(lambda values: rollout(replace(free, values), solver).trajectory.sample.command))
     command = np.asarray(asked(box.lanes()))
     return float(command.min()), float(command.max())

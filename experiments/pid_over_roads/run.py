@@ -83,14 +83,14 @@ def loops(config: Config) -> dict[str, Loop]:
     return {name: braking(plant=car, reference=r, controller=pi, stop=stop) for name, r in references.items()}
 
 
-def tuned(config: Config, known: Family, one: Loop, progress: Any = None) -> Tuned:
+def tuned(config: Config, tuning_roads: Family, loop: Loop, progress: Any = None) -> Tuned:
     """kp, ki, the tracking time of an anti-windup and the (first) target slip; of the estimator its filter, too."""
     return tune(
         build_problem(
-            screened(config, one) if isinstance(one.reference, PeakRobust) else wound(config, one),
-            free=free(config, one),
+            screened(config, loop) if isinstance(loop.reference, PeakRobust) else wound(config, loop),
+            free=free(config, loop),
             objective={"stop_distance": 1.0},
-            over=known.with_paper(config.own_share),
+            over=tuning_roads.with_paper(config.own_share),
             solver=FixedStep(step=config.step, duration=config.longest),
         ),
         method=Method(stopping=Stopping(iterations=config.iterations, change=1e-5)),
@@ -98,51 +98,55 @@ def tuned(config: Config, known: Family, one: Loop, progress: Any = None) -> Tun
     )
 
 
-def free(config: Config, one: Loop) -> dict[str, tuple[float, float]]:
+def free(config: Config, loop: Loop) -> dict[str, tuple[float, float]]:
     """Ranges by path."""
-    ranges = config.ranges + (config.estimator if isinstance(one.reference, PeakRobust) else ())
+    ranges = config.ranges + (config.estimator if isinstance(loop.reference, PeakRobust) else ())
     return {path: (low, high) for path, low, high in ranges}
 
 
-def wound(config: Config, one: Loop) -> Loop:
+def wound(config: Config, loop: Loop) -> Loop:
     """A fast integral with an anti-windup, where tuning starts."""
     antiwindup = BackCalculation(tracking_time=config.tracking)
-    return dataclasses.replace(one, controller=dataclasses.replace(one.controller, ki=config.ki, antiwindup=antiwindup))
+    return dataclasses.replace(
+        loop, controller=dataclasses.replace(loop.controller, ki=config.ki, antiwindup=antiwindup)
+    )
 
 
-def screened(config: Config, one: Loop) -> Loop:
+def screened(config: Config, loop: Loop) -> Loop:
     """The best start among many for a loop with an estimator: a Sobol sequence in logarithms over the ranges."""
-    one, ranges = wound(config, one), free(config, one)
+    loop, ranges = wound(config, loop), free(config, loop)
     low, high = np.log(np.array(list(ranges.values()))).T
     points = qmc.Sobol(len(ranges), rng=np.random.default_rng(config.seed)).random(config.candidates)
     gains = dict(zip(ranges, np.exp(low + (high - low) * points).T, strict=True))
-    own = dataclasses.replace(one, plant=QuarterCar(), stop=Standstill(speed=1.0))
-    far = distances(own, gains, FixedStep(step=config.screening, duration=4.0)) / slip_estimator.BOUNDS["90 N m"] - 1
+    own_loop = dataclasses.replace(loop, plant=QuarterCar(), stop=Standstill(speed=1.0))
+    far = (
+        distances(own_loop, gains, FixedStep(step=config.screening, duration=4.0)) / slip_estimator.BOUNDS["90 N m"] - 1
+    )
     near = np.argsort(far)[: min(config.kept, int(np.sum(far < config.near)))]
     few = family(config, config.few, config.seed)
     lanes = {path: np.repeat(column[near], config.few) for path, column in gains.items()}
     lanes |= {path: np.concatenate([column] * len(near)) for path, column in few.values.items()}
-    found = distances(one, lanes, FixedStep(step=config.step, duration=config.longest))
-    mean = (found.reshape(len(near), config.few) / few.distance).mean(axis=1)
+    stops = distances(loop, lanes, FixedStep(step=config.step, duration=config.longest))
+    mean = (stops.reshape(len(near), config.few) / few.distance).mean(axis=1)
     best = near[np.argmin(mean)]
-    return replace(one, {path: float(column[best]) for path, column in gains.items()})
+    return replace(loop, {path: float(column[best]) for path, column in gains.items()})
 
 
-def distances(one: Loop, lanes: dict[str, Any], solver: FixedStep) -> np.ndarray:
+def distances(loop: Loop, lanes: dict[str, Any], solver: FixedStep) -> np.ndarray:
     """Of lanes that differ in these values; infinite for one that diverges."""
-    found = run_batch(one, Batch(lanes), solver, {"stop_distance": BRAKING["stop_distance"]})
-    return np.nan_to_num(np.asarray(found.metrics["stop_distance"]), nan=np.inf)
+    runs = run_batch(loop, Batch(lanes), solver, {"stop_distance": BRAKING["stop_distance"]})
+    return np.nan_to_num(np.asarray(runs.metrics["stop_distance"]), nan=np.inf)
 
 
-def judged(config: Config, one: Loop, unseen: Family, noise: float = 0.0) -> dict[str, np.ndarray]:
+def judged(config: Config, loop: Loop, unseen: Family, noise: float = 0.0) -> dict[str, np.ndarray]:
     """Metrics of every lane of a family."""
     keys = None
     if noise:
-        one = dataclasses.replace(one, sensor=Noise(deceleration=noise, period=1e-3))
+        loop = dataclasses.replace(loop, sensor=Noise(deceleration=noise, period=1e-3))
         keys = np.arange(len(unseen.time))
     solver = FixedStep(step=config.fine, duration=config.longest)
-    done = jax.device_get(run_batch(one, Batch(unseen.values, keys), solver, MEASURED))
-    return {**done.metrics, "stopped": done.stopped, "diverged": done.diverged}
+    runs = jax.device_get(run_batch(loop, Batch(unseen.values, keys), solver, MEASURED))
+    return {**runs.metrics, "stopped": runs.stopped, "diverged": runs.diverged}
 
 
 def compared(config: Config, name: str, before: Any, after: Any, unseen: Family) -> dict[str, Any]:
@@ -166,15 +170,15 @@ def compared(config: Config, name: str, before: Any, after: Any, unseen: Family)
     }
 
 
-def own_road(config: Config, name: str, one: Loop) -> dict[str, Any]:
+def own_road(config: Config, name: str, loop: Loop) -> dict[str, Any]:
     """On the paper's own road, to standstill."""
     bound = slip_estimator.BOUNDS["90 N m"]
-    one = dataclasses.replace(one, plant=QuarterCar(), stop=Standstill())
-    distance = float(measure(one, FixedStep(step=config.own_step, duration=3.6), BRAKING).metrics["stop_distance"])
+    loop = dataclasses.replace(loop, plant=QuarterCar(), stop=Standstill())
+    distance = float(measure(loop, FixedStep(step=config.own_step, duration=3.6), BRAKING).metrics["stop_distance"])
     return {"control": name, "distance [m]": distance, "above the bound of 90 N m [%]": 100 * (distance / bound - 1)}
 
 
-def figures(results: dict[str, Any], found: dict[str, Tuned]) -> dict[str, Any]:
+def figures(results: dict[str, Any], tunings: dict[str, Tuned]) -> dict[str, Any]:
     """How the relative distances are distributed, before and after, and how the tuning went."""
     figure, axes = plot.sheet(1, 2, title="Braking distance over roads not tuned for", size=(5.6, 3.6), sharey=True)
     for i, (ax, (name, pair)) in enumerate(zip(axes, results.items(), strict=True)):
@@ -184,8 +188,8 @@ def figures(results: dict[str, Any], found: dict[str, Tuned]) -> dict[str, Any]:
         ax.set_xlim(1.0, 1.5)
         plot.label_axes(ax, "distance/shortest possible [1]", "" if i else "share of the roads", name)
     history, (ax,) = plot.sheet(title="How the tuning went", size=(6.0, 3.6))
-    for i, (name, one) in enumerate(found.items()):
-        points = [(p.evaluations, p.objective) for p in one.history]
+    for i, (name, tuning) in enumerate(tunings.items()):
+        points = [(p.evaluations, p.objective) for p in tuning.history]
         ax.plot(*zip(*points, strict=True), "o-", markersize=3, color=plot.COLOURS[i], label=name)
     plot.label_axes(ax, "gradients computed", "mean distance/shortest possible [1]")
     return {"distances": figure, "tuning": history}
@@ -194,29 +198,32 @@ def figures(results: dict[str, Any], found: dict[str, Tuned]) -> dict[str, Any]:
 def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config = config or Config()
-    known, unseen = family(config, config.roads, config.seed), family(config, config.held_out, config.seed + 1)
-    rows, own, gains, curves, found = [], [], [], {}, {}
-    for name, one in loops(config).items():
-        found[name] = tuned(config, known, one, progress)
-        tuned_loop = found[name].loop
+    tuning_roads, unseen = family(config, config.roads, config.seed), family(config, config.held_out, config.seed + 1)
+    rows, own_rows, gains, curves, tunings = [], [], [], {}, {}
+    for name, loop in loops(config).items():
+        tunings[name] = tuned(config, tuning_roads, loop, progress)
+        tuned_loop = tunings[name].loop
         for label, noise in (("", 0.0), (f", noise {config.noise:g} m/s2", config.noise)):
-            before, after = (judged(config, x, unseen, noise) for x in (one, tuned_loop))
+            before, after = (judged(config, x, unseen, noise) for x in (loop, tuned_loop))
             rows.append(compared(config, name + label, before, after, unseen))
             if not noise:
                 curves[name] = {
                     "paper's gains": before["stop_distance"] / unseen.distance,
                     "tuned": after["stop_distance"] / unseen.distance,
                 }
-        own += [own_road(config, f"{name}, paper's gains", one), own_road(config, f"{name}, tuned", tuned_loop)]
-        gains.append({"control": name, **{k: float(v) for k, v in found[name].values.items()}})
+        own_rows += [own_road(config, f"{name}, paper's gains", loop), own_road(config, f"{name}, tuned", tuned_loop)]
+        gains.append({"control": name, **{k: float(v) for k, v in tunings[name].values.items()}})
     record.print_rows(f"{config.held_out} roads that the tuning has not seen, {config.confidence:.0%} interval", rows)
-    record.print_rows("The paper's own road (spline B)", own)
+    record.print_rows("The paper's own road (spline B)", own_rows)
     for line in gains:
         record.print_rows("Tuned", [line])
     how = {
-        k: {"reason": f.reason.value, "evaluations": f.evaluations, "objective": f.objective} for k, f in found.items()
+        k: {"reason": f.reason.value, "evaluations": f.evaluations, "objective": f.objective}
+        for k, f in tunings.items()
     }
-    return record.experiment(config, {"table": rows, "own": own, "gains": gains, "tuning": how}, figures(curves, found))
+    return record.experiment(
+        config, {"table": rows, "own": own_rows, "gains": gains, "tuning": how}, figures(curves, tunings)
+    )
 
 
 if __name__ == "__main__":

@@ -44,18 +44,18 @@ def near_corner(config: Config, speed: str, corner: dict[str, float]) -> dict[st
     return {name: corner[name] + 0.2 * (x - corner[name]) for name, x in points.items()}
 
 
-def judged(config: Config, speed: str, name: str, one: Loop) -> dict[str, Any]:
+def judged(config: Config, speed: str, name: str, loop: Loop) -> dict[str, Any]:
     """Return the judgement of a loop on corners and points of the box, and of a tuned estimator that never restarts."""
     tuned = name.startswith("tuned")
     samples = config.judging.samples if tuned else config.judging.fewer
     found = {
-        "corners": in_corners(one, config.box, config.fixed, speed, config.judging),
-        "box": on_samples(one, config.box, config.fixed, speed, config.judging, samples),
+        "corners": in_corners(loop, config.box, config.fixed, speed, config.judging),
+        "box": on_samples(loop, config.box, config.fixed, speed, config.judging, samples),
     }
     if name == "tuned-cvar" and speed == ESTIMATED:
         points = drawn(config.box, speed, samples, config.judging.seed)
-        never = runs(replace(one, {"sensor.blocks.4.rest": RAREST}), points, config.judging, config.judging.seed)
-        near = runs(one, near_corner(config, speed, found["corners"]["at"]), config.judging, config.judging.seed + 4)
+        never = runs(replace(loop, {"sensor.blocks.4.rest": RAREST}), points, config.judging, config.judging.seed)
+        near = runs(loop, near_corner(config, speed, found["corners"]["at"]), config.judging, config.judging.seed + 4)
         found["near the worst corner, overshoot [%]"] = 100 * float(near["overshoot"].max())
         found["without rest, does not stop"] = chance(~never["stopped"], config.judging.confidence)
     return found

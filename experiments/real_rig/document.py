@@ -68,11 +68,11 @@ LAWS = {
 HELD = "u = u_k from t_k + delay to t_(k+1) + delay, 0 before the first"
 
 
-def document(one: Loop) -> dict[str, Any]:
+def document(loop: Loop) -> dict[str, Any]:
     """Return equations and parameters of a loop of `loops.py`, SI units."""
-    blocks: Any = one.sensor.blocks  # pyright: ignore[reportAttributeAccessIssue]
-    inner: Any = one.controller.controller  # pyright: ignore[reportAttributeAccessIssue]
-    kinds = {"speed": blocks[-1], "reference": one.reference, "controller": inner}
+    blocks: Any = loop.sensor.blocks  # pyright: ignore[reportAttributeAccessIssue]
+    inner: Any = loop.controller.controller  # pyright: ignore[reportAttributeAccessIssue]
+    kinds = {"speed": blocks[-1], "reference": loop.reference, "controller": inner}
     return {
         "kinds": {name: type(part).__name__ for name, part in kinds.items()},
         "sensors": [type(block).__name__ for block in blocks],
@@ -81,14 +81,14 @@ def document(one: Loop) -> dict[str, Any]:
             "every period h, in this order": [
                 WHEEL,
                 *SEEN[type(blocks[-1]).__name__],
-                *ASKED[type(one.reference).__name__],
+                *ASKED[type(loop.reference).__name__],
                 *LAWS[type(inner).__name__],
             ],
             "held": HELD,
         },
         "parameters": {
             path: {"value": np.asarray(value, float).tolist(), "unit": spec.unit}
-            for path, spec, value in parameters(one)
+            for path, spec, value in parameters(loop)
         },
     }
 

@@ -50,7 +50,7 @@ LEVELS = (0, 2, 5, 10, 20, 40, 60, 100)  # %
 SEEDS = 2
 
 
-def degradation(one: Loop, speed: str, config: Judging, count: int) -> Maps:
+def degradation(loop: Loop, speed: str, config: Judging, count: int) -> Maps:
     """Return the overshoot [%] over pairs of parameters around the nominal point (count, count): the worst of SEEDS
     noises, drawn for each point."""
     found = {}
@@ -61,7 +61,7 @@ def degradation(one: Loop, speed: str, config: Judging, count: int) -> Maps:
         points |= {pair.x: grid[0].ravel(), pair.y: grid[1].ravel()}
         if pair.x == "last":
             points["first"] = points["last"]
-        worst = runs(one, points, config, config.seed + 3)
+        worst = runs(loop, points, config, config.seed + 3)
         overshoot = worst["overshoot"].reshape(grid[0].shape).max(axis=2)
         locked = worst["locked"].reshape(grid[0].shape).max(axis=2)
         found[f"{pair.x}, {pair.y}"] = {

@@ -61,25 +61,25 @@ class Judging:
     engine: str = "auto"
 
 
-def runs(one: Loop, points: dict[str, np.ndarray], config: Judging, seed: int) -> dict[str, np.ndarray]:
+def runs(loop: Loop, points: dict[str, np.ndarray], config: Judging, seed: int) -> dict[str, np.ndarray]:
     """Metrics at points of a box, each with a noise of its own, and whether the run stopped. One that diverges counts
     as locked."""
     lanes = batch(columns(points), seed)
     places = np.arange(config.block * -(-lanes.size // config.block)).clip(max=lanes.size - 1)
-    blocks = [_block(one, lanes, at, config) for at in places.reshape(-1, config.block)]
-    found: Any = jax.tree.map(lambda *parts: np.concatenate(parts)[: lanes.size], *blocks)
+    blocks = [_block(loop, lanes, at, config) for at in places.reshape(-1, config.block)]
+    results: Any = jax.tree.map(lambda *parts: np.concatenate(parts)[: lanes.size], *blocks)
     worst = {"overshoot": LOST, "deviation": LOST, "locked": LONGEST, "settling": LONGEST}
-    metrics = {name: np.where(found.diverged, worst.get(name, np.nan), found.metrics[name]) for name in MEASURED}
+    metrics = {name: np.where(results.diverged, worst.get(name, np.nan), results.metrics[name]) for name in MEASURED}
     never = np.isinf(metrics["settling"])  # a run that never settles counts with its length: quantiles stay finite
-    metrics["settling"] = np.where(never, found.ending.sample.t, metrics["settling"])
-    return metrics | {"stopped": found.stopped & ~found.diverged}
+    metrics["settling"] = np.where(never, results.ending.sample.t, metrics["settling"])
+    return metrics | {"stopped": results.stopped & ~results.diverged}
 
 
-def _block(one: Loop, lanes: Batch, at: np.ndarray, config: Judging) -> Any:
+def _block(loop: Loop, lanes: Batch, at: np.ndarray, config: Judging) -> Any:
     assert lanes.keys is not None
     some = Batch({path: column[at] for path, column in lanes.values.items()}, lanes.keys[at])
     solver = FixedStep(step=config.step, duration=LONGEST, kinks=False)
-    return jax.device_get(run_batch(one, some, solver, MEASURED, engine=config.engine))
+    return jax.device_get(run_batch(loop, some, solver, MEASURED, engine=config.engine))
 
 
 def spots(speed: str) -> dict[str, dict[str, np.ndarray]]:
@@ -97,12 +97,14 @@ def _fits(at: dict[str, float], speed: str) -> bool:
     return not set(at) & set(other)
 
 
-def weak_spots(one: Loop, speed: str, config: Judging) -> dict[str, float]:
+def weak_spots(loop: Loop, speed: str, config: Judging) -> dict[str, float]:
     """Return the worst overshoot [%] under one deviation."""
-    those = spots(speed)
-    together = {name: np.concatenate([at[name] for at in those.values()]) for name in next(iter(those.values()))}
-    overshoot = runs(one, together, config, config.seed + 1)["overshoot"].reshape(len(those), -1)
-    return dict(zip(those, (100 * overshoot.max(axis=1)).tolist(), strict=True))
+    spot_points = spots(speed)
+    together = {
+        name: np.concatenate([at[name] for at in spot_points.values()]) for name in next(iter(spot_points.values()))
+    }
+    overshoot = runs(loop, together, config, config.seed + 1)["overshoot"].reshape(len(spot_points), -1)
+    return dict(zip(spot_points, (100 * overshoot.max(axis=1)).tolist(), strict=True))
 
 
 def shortest(points: dict[str, np.ndarray], fixed: Fixed) -> np.ndarray:
@@ -113,24 +115,29 @@ def shortest(points: dict[str, np.ndarray], fixed: Fixed) -> np.ndarray:
 
 def chance(happens: np.ndarray, confidence: float) -> dict[str, Any]:
     """Probability in per cent with the interval of Clopper and Pearson."""
-    found = Count(int(happens.sum()), happens.size).probability(confidence=confidence)
-    return {"percent": 100 * found.value, "low": 100 * found.low, "high": 100 * found.high, "count": int(happens.sum())}
+    estimate = Count(int(happens.sum()), happens.size).probability(confidence=confidence)
+    return {
+        "percent": 100 * estimate.value,
+        "low": 100 * estimate.low,
+        "high": 100 * estimate.high,
+        "count": int(happens.sum()),
+    }
 
 
-def on_samples(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging, samples: int) -> dict[str, Any]:
+def on_samples(loop: Loop, box: Box, fixed: Fixed, speed: str, config: Judging, samples: int) -> dict[str, Any]:
     """Probabilities and quantiles on so many points of the box."""
     points = drawn(box, speed, samples, config.seed)
-    found, least = runs(one, points, config, config.seed), floor(points, speed, fixed)
+    metrics, least = runs(loop, points, config, config.seed), floor(points, speed, fixed)
     widest = 4 * max(map(abs, (*box.first, *box.last)))  # the floor of the box, of a known speed
-    overshoot, lost = found["overshoot"], found["distance"] / shortest(points, fixed) - 1
-    off = found["deviation"] - floor(points, speed, fixed, two_sided=True)
-    fine = (found["locked"] == 0) & found["stopped"]
+    overshoot, lost = metrics["overshoot"], metrics["distance"] / shortest(points, fixed) - 1
+    off = metrics["deviation"] - floor(points, speed, fixed, two_sided=True)
+    fine = (metrics["locked"] == 0) & metrics["stopped"]
     low = least > 0.01
-    said = {
+    row = {
         "overshoot > 1 %": chance(overshoot > 0.01, config.confidence),
         "overshoot > 5 %": chance(overshoot > 0.05, config.confidence),
-        "locks": chance(found["locked"] > 0, config.confidence),
-        "does not stop": chance(~found["stopped"], config.confidence),
+        "locks": chance(metrics["locked"] > 0, config.confidence),
+        "does not stop": chance(~metrics["stopped"], config.confidence),
         "within 1.5 floors of the box": chance(overshoot <= ENOUGH * widest, config.confidence),
         "within 1.5 floors of its own, where that exceeds 1 %": chance(
             overshoot[low] <= ENOUGH * least[low], config.confidence
@@ -140,12 +147,14 @@ def on_samples(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging, s
         "deviation above the floor [%]": quantiles(100 * off),
         "deviation near the floor": chance(off <= NEAR, config.confidence),
         "meets the requirement": bool(fine.all() and np.mean(off <= NEAR) >= REQUIRED),
-        "settling [s]": quantiles(found["settling"]),
-        "settled within 0.25 s": chance(found["settling"] <= HELD, config.confidence),
+        "settling [s]": quantiles(metrics["settling"]),
+        "settled within 0.25 s": chance(metrics["settling"] <= HELD, config.confidence),
         "distance lost [%]": quantiles(100 * lost),
         "samples": samples,
     }
-    return said | ({"against the true speed": against_truth(one, points, found, config)} if speed == ESTIMATED else {})
+    return row | (
+        {"against the true speed": against_truth(loop, points, metrics, config)} if speed == ESTIMATED else {}
+    )
 
 
 def quantiles(values: np.ndarray) -> dict[str, float]:
@@ -160,27 +169,29 @@ def seconds(time: float) -> str:
     return f"{time:.3f}" if time <= LONGEST else "never"
 
 
-def against_truth(one: Loop, points: Any, found: Any, config: Judging) -> dict[str, float]:
+def against_truth(loop: Loop, points: Any, metrics: Any, config: Judging) -> dict[str, float]:
     """Stopping distance, in per cent longer than under the same controller that sees the true speed with the same noise
     of the wheel."""
     from experiments.real_rig.loops import with_truth
 
     known = {name: value for name, value in points.items() if name != "bias"}
-    truth = runs(with_truth(one), known | {name: 0 * points["mass"] for name in ("first", "last")}, config, config.seed)
-    return quantiles(100 * (found["distance"] / truth["distance"] - 1))
+    truth = runs(
+        with_truth(loop), known | {name: 0 * points["mass"] for name in ("first", "last")}, config, config.seed
+    )
+    return quantiles(100 * (metrics["distance"] / truth["distance"] - 1))
 
 
-def in_corners(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging) -> dict[str, Any]:
+def in_corners(loop: Loop, box: Box, fixed: Fixed, speed: str, config: Judging) -> dict[str, Any]:
     """The worst of all corners, with a few noises each, and which it is."""
     points = corners(box, speed, config.corner_seeds)
-    found, least = runs(one, points, config, config.seed + 2), floor(points, speed, fixed)
-    worst = int(np.argmax(found["overshoot"]))
+    metrics, least = runs(loop, points, config, config.seed + 2), floor(points, speed, fixed)
+    worst = int(np.argmax(metrics["overshoot"]))
     return {
-        "overshoot [%]": float(100 * found["overshoot"][worst]),
+        "overshoot [%]": float(100 * metrics["overshoot"][worst]),
         "floor there [%]": float(100 * least[worst]),
-        "above the floor, most [%]": float(100 * np.max(found["overshoot"] - least)),
+        "above the floor, most [%]": float(100 * np.max(metrics["overshoot"] - least)),
         "at": {name: float(value[worst]) for name, value in points.items()},
-        "locks": int((found["locked"] > 0).sum()),
-        "do not stop": int((~found["stopped"]).sum()),
+        "locks": int((metrics["locked"] > 0).sum()),
+        "do not stop": int((~metrics["stopped"]).sum()),
         "corners": len(points["mass"]) // config.corner_seeds,
     }

@@ -56,21 +56,21 @@ def loop(
     )
 
 
-def located(one: Loop) -> Loop:
+def located(loop: Loop) -> Loop:
     """The same loop with the computing delay located by events: the reference that `loop` is checked against."""
-    grid: Any = one.controller
+    grid: Any = loop.controller
     sampled = Sampled(controller=grid.controller, period=grid.sampling_period, delay=grid.delay)
-    return dataclasses.replace(one, controller=sampled)
+    return dataclasses.replace(loop, controller=sampled)
 
 
-def with_truth(one: Loop) -> Loop:
+def with_truth(loop: Loop) -> Loop:
     """Return the same loop with the true speed of the vehicle, and the same noise of the wheel's speed."""
-    wheel = one.sensor.blocks[:2]  # pyright: ignore[reportAttributeAccessIssue]
-    return dataclasses.replace(one, sensor=Series(blocks=(*wheel, DriftingSpeed())))
+    wheel = loop.sensor.blocks[:2]  # pyright: ignore[reportAttributeAccessIssue]
+    return dataclasses.replace(loop, sensor=Series(blocks=(*wheel, DriftingSpeed())))
 
 
-def quantised(one: Loop, fixed: Fixed) -> Loop:
+def quantised(loop: Loop, fixed: Fixed) -> Loop:
     """The same loop with the quantisation of the wheel's speed in place of the noise that it was tuned with."""
-    first, _, *others = one.sensor.blocks  # pyright: ignore[reportAttributeAccessIssue]
+    first, _, *others = loop.sensor.blocks  # pyright: ignore[reportAttributeAccessIssue]
     steps = Quantisation(wheel_speed=fixed.quantum)
-    return dataclasses.replace(one, sensor=Series(blocks=(first, steps, *others)))
+    return dataclasses.replace(loop, sensor=Series(blocks=(first, steps, *others)))

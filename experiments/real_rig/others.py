@@ -60,11 +60,11 @@ class Score:
             self.points, speed, fixed, two_sided=two_sided
         )
 
-    def __call__(self, one: Loop) -> float:
+    def __call__(self, loop: Loop) -> float:
         """Of a loop; a great number where a run diverges."""
-        found = runs(one, self.points, self.judging, self.config.seed)
+        metrics = runs(loop, self.points, self.judging, self.config.seed)
         self.rollouts += self.config.lanes
-        each = sum(weight * found[name] for name, weight in self.weights.items()) - self.floors
+        each = sum(weight * metrics[name] for name, weight in self.weights.items()) - self.floors
         each = np.sort(np.nan_to_num(each, nan=1e3, posinf=1e3))
         tail = each[-int(np.ceil(len(each) * (1 - self.config.level))) :]
         return float(tail.mean())
@@ -73,29 +73,29 @@ class Score:
 Free = dict[str, Any]
 
 
-def nelder_mead(score: Score, one: Loop, free: Free, config: Others) -> Loop:
+def nelder_mead(score: Score, loop: Loop, free: Free, config: Others) -> Loop:
     """Nelder and Mead's search in the coordinates of `tune`."""
-    coordinates = parameter_space(one, free)
+    coordinates = parameter_space(loop, free)
     options = {"maxfev": config.evaluations, "xatol": 1e-4, "fatol": 1e-6}
-    found = minimize(
-        lambda z: score(_at(one, coordinates, z)), coordinates.place(one), method="Nelder-Mead", options=options
+    minimum = minimize(
+        lambda z: score(_at(loop, coordinates, z)), coordinates.place(loop), method="Nelder-Mead", options=options
     )
-    return _at(one, coordinates, found.x)
+    return _at(loop, coordinates, minimum.x)
 
 
-def cma_es(score: Score, one: Loop, free: Free, config: Others) -> Loop:
+def cma_es(score: Score, loop: Loop, free: Free, config: Others) -> Loop:
     """CMA-ES in the coordinates of `tune`."""
-    coordinates = parameter_space(one, free)
+    coordinates = parameter_space(loop, free)
     options = {"maxfevals": config.evaluations, "verbose": -9, "seed": config.seed, "verb_log": 0}
-    search = cma.CMAEvolutionStrategy(coordinates.place(one), 0.5, options)
+    search = cma.CMAEvolutionStrategy(coordinates.place(loop), 0.5, options)
     while not search.stop():
         asked = search.ask()
-        search.tell(asked, [score(_at(one, coordinates, z)) for z in asked])
-    return _at(one, coordinates, search.result.xbest)
+        search.tell(asked, [score(_at(loop, coordinates, z)) for z in asked])
+    return _at(loop, coordinates, search.result.xbest)
 
 
-def _at(one: Loop, coordinates: Any, z: Any) -> Loop:
-    return replace(one, {path: np.asarray(value) for path, value in coordinates.values(z).items()})
+def _at(loop: Loop, coordinates: Any, z: Any) -> Loop:
+    return replace(loop, {path: np.asarray(value) for path, value in coordinates.values(z).items()})
 
 
 def designs(config: Others, box: Box, fixed: Fixed) -> dict[str, list[np.ndarray]]:
@@ -140,27 +140,27 @@ def contenders(
     robust: dict[str, list[np.ndarray]],
     estimator: Any,
     score: Score,
-    told: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> dict[str, tuple[Loop, int]]:
     """Return loops by name, and the number of runs behind each. `robust`: the gains of `designs`."""
 
     def feedback(gain: Any) -> Loop:
         return loop(fixed, StateFeedback(gain=np.asarray(gain, float)), speed, estimator=estimator)
 
-    found: dict[str, tuple[Loop, int]] = {"published gain": (feedback(lmi_design.PUBLISHED_GAIN), 0)}
+    results: dict[str, tuple[Loop, int]] = {"published gain": (feedback(lmi_design.PUBLISHED_GAIN), 0)}
     for name, gains in robust.items():
         score.rollouts = 0
-        those = [feedback(gain) for gain in gains]
-        if those:
-            found[f"{name}, best of {len(those)}"] = (
-                those[int(np.argmin([score(one) for one in those]))],
+        loops = [feedback(gain) for gain in gains]
+        if loops:
+            results[f"{name}, best of {len(loops)}"] = (
+                loops[int(np.argmin([score(candidate) for candidate in loops]))],
                 score.rollouts,
             )
-        told(name)
+        report(name)
     cured: Any = load("slip-cured", integrated=False).loop
     target = FilteredSlip(slip=fixed.slip, time_constant=cured.reference.time_constant)
     first = ProportionalFeedback(gain=np.asarray(cured.controller.controller.gain, float))
-    found["first cure"] = (loop(fixed, first, speed, target, estimator), 0)
+    results["first cure"] = (loop(fixed, first, speed, target, estimator), 0)
     searches = {
         "PI, Nelder-Mead": (nelder_mead, *proportional_integral(config)),
         "PI, CMA-ES": (cma_es, *proportional_integral(config)),
@@ -168,10 +168,10 @@ def contenders(
     }
     for name, (search, controller, free) in searches.items():
         score.rollouts = 0
-        one = loop(fixed, controller, speed, estimator=estimator)
-        found[name] = (search(score, one, free, config), score.rollouts)
-        told(name)
-    return found
+        candidate = loop(fixed, controller, speed, estimator=estimator)
+        results[name] = (search(score, candidate, free, config), score.rollouts)
+        report(name)
+    return results
 
 
 def proportional_integral(config: Others) -> tuple[PID, Free]:

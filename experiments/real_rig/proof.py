@@ -48,9 +48,9 @@ class Proving:
     grid: int = 5
 
 
-def gain(one: Loop) -> tuple[np.ndarray, str] | None:
+def gain(loop: Loop) -> tuple[np.ndarray, str] | None:
     """K of a linear controller, and whether it is fixed or proportional to the speed; None for another."""
-    inner: Any = one.controller.controller  # pyright: ignore[reportAttributeAccessIssue]
+    inner: Any = loop.controller.controller  # pyright: ignore[reportAttributeAccessIssue]
     if isinstance(inner, PID):
         return np.array([-float(inner.ki), -float(inner.kp)]), "fixed"
     if isinstance(inner, StateFeedback):

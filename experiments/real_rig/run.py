@@ -66,12 +66,12 @@ def scored(config: Config, speed: str, weights: Any = ONE_SIDED) -> Score:
 
 
 def compared(
-    config: Config, speed: str, robust: dict[str, Any], stages: dict[str, Tuned], told: Any
+    config: Config, speed: str, robust: dict[str, Any], stages: dict[str, Tuned], report: Any
 ) -> dict[str, tuple[Loop, int]]:
     """Return all loops of one kind of speed by name, with the runs behind each. All have the same estimated speed."""
     best: Any = stages["CVaR"].loop
     estimator = None if speed == KNOWN else best.sensor.blocks[-1]
-    found = contenders(config.others, config.fixed, speed, robust, estimator, scored(config, speed), told)
+    found = contenders(config.others, config.fixed, speed, robust, estimator, scored(config, speed), report)
     if "both sides" in stages:
         score = scored(config, speed, TWO_SIDED)
         pi, free = proportional_integral(config.others)
@@ -79,19 +79,19 @@ def compared(
             cma_es(score, loop(config.fixed, pi, speed), free, config.others),
             score.rollouts,
         )
-        told("PI, CMA-ES, both sides")
+        report("PI, CMA-ES, both sides")
     own = {name: (stages[stage].loop, cost(config, stages, stage)) for stage, name in STAGES.items() if stage in stages}
     own = {BEFORE: (start(config.tuning, config.fixed, speed), 0)} | own
     return found | {name: (quantised(one, config.fixed), runs) for name, (one, runs) in own.items()}
 
 
-def judged(config: Config, speed: str, name: str, one: Loop) -> dict[str, Any]:
+def judged(config: Config, speed: str, name: str, loop: Loop) -> dict[str, Any]:
     """Weak spots, corners, points of the box."""
     samples = config.judging.samples if name in STAGES.values() else config.judging.fewer
     return {
-        "weak spots: overshoot [%]": weak_spots(one, speed, config.judging),
-        "corners": in_corners(one, config.box, config.fixed, speed, config.judging),
-        "box": on_samples(one, config.box, config.fixed, speed, config.judging, samples),
+        "weak spots: overshoot [%]": weak_spots(loop, speed, config.judging),
+        "corners": in_corners(loop, config.box, config.fixed, speed, config.judging),
+        "box": on_samples(loop, config.box, config.fixed, speed, config.judging, samples),
     }
 
 
@@ -99,25 +99,27 @@ def printed(speed: str, results: dict[str, dict[str, Any]]) -> None:
     """The table, in two: weak spots, and the rest."""
     record.print_rows(
         f"Speed {speed}: worst overshoot [%] where one thing is wrong",
-        [{"controller": name, **one["weak spots: overshoot [%]"]} for name, one in results.items()],
+        [{"controller": name, **result["weak spots: overshoot [%]"]} for name, result in results.items()],
     )
-    record.print_rows(f"Speed {speed}: the box", [{"controller": name, **row(one)} for name, one in results.items()])
+    record.print_rows(
+        f"Speed {speed}: the box", [{"controller": name, **row(result)} for name, result in results.items()]
+    )
 
 
-def row(one: dict[str, Any]) -> dict[str, Any]:
+def row(result: dict[str, Any]) -> dict[str, Any]:
     """Return a line of the table."""
 
     def interval(name: str) -> str:
-        p = one["box"][name]
+        p = result["box"][name]
         return f"{p['percent']:.4g} ({p['low']:.3g}-{p['high']:.3g})"
 
-    box, proof = one["box"], one["proof"]
+    box, proof = result["box"], result["proof"]
     truth = box.get("against the true speed", {"median": 0.0, "95 %": 0.0})
     rate = proof.get("decay [1/s]")
     return {
-        "objective": f"{one['objective']:.4f}",
-        "of both sides": f"{one['objective, both sides']:.4f}",
-        "worst corner [%]": f"{one['corners']['overshoot [%]']:.1f}",
+        "objective": f"{result['objective']:.4f}",
+        "of both sides": f"{result['objective, both sides']:.4f}",
+        "worst corner [%]": f"{result['corners']['overshoot [%]']:.1f}",
         "P(> 1 %) [%]": interval("overshoot > 1 %"),
         "P(> 5 %) [%]": interval("overshoot > 5 %"),
         "P(locks) [%]": interval("locks"),
@@ -129,19 +131,19 @@ def row(one: dict[str, Any]) -> dict[str, Any]:
         "lost median [%]": f"{box['distance lost [%]']['median']:.2f}",
         "longer than with the true speed, median, 95 % [%]": f"{truth['median']:.2f}, {truth['95 %']:.2f}",
         "certificate": proof["said"] + ("" if rate is None else f", {rate:.2g} /s"),
-        "runs to find": one["runs to find"],
+        "runs to find": result["runs to find"],
     }
 
 
 def of_speed(
-    config: Config, speed: str, robust: dict[str, Any], told: Any
+    config: Config, speed: str, robust: dict[str, Any], report: Any
 ) -> tuple[dict[str, Tuned], dict[str, Loop], dict[str, Any]]:
     """Tune, compare, judge, prove. Returns the stages of the tuning, the loops, and the results of each."""
-    stages = tuned(config.tuning, config.box, config.fixed, speed, told)
-    those = compared(config, speed, robust, stages, lambda name: told(f"{speed}, found: {name}"))
+    stages = tuned(config.tuning, config.box, config.fixed, speed, report)
+    those = compared(config, speed, robust, stages, lambda name: report(f"{speed}, found: {name}"))
     loops = {name: one for name, (one, _) in those.items()}
     proved = proofs(config.proving, config.box, config.fixed, loops)
-    told(f"{speed}, proofs")
+    report(f"{speed}, proofs")
     results, score, both = {}, scored(config, speed), scored(config, speed, TWO_SIDED)
     for name, (one, runs) in those.items():
         found = {
@@ -151,7 +153,7 @@ def of_speed(
             "runs to find": runs,
         }
         results[name] = {**judged(config, speed, name, one), **found}
-        told(f"{speed}, judged: {name}")
+        report(f"{speed}, judged: {name}")
     return stages, loops, results
 
 

@@ -1,7 +1,7 @@
 """The worst case of a controller in a box of plant, road, actuator and speed, and a certificate over the box.
 
 Gradient ascent starts from the worst corner and from the worst of a few random points. It is compared with 100,000
-random samples and with the 32 corners alone. The controllers are the published gain and the cured one (scenario
+random samples and with the 32 corners alone. The controllers are the published gain and the cured loop (scenario
 slip-cured), on the rig with torque limits, lag and sampling. A counterexample needs no proof, but its absence does. So
 `certify` gets the linear loop over the same box.
 
@@ -29,6 +29,7 @@ from diffabs.robust.design.speed_scaled import SpeedScaled, greatest_speed_fall
 from diffabs.robust.design.state_feedback import feedback_gain
 from diffabs.scenario.scenario import load
 from diffabs.tune import WorstCase, grid, worst_case
+from experiments._shared.numbers import store_numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,10 +64,10 @@ def loops() -> dict[str, Loop]:
     return {"published gain": published, "the cure": cure}
 
 
-def found(config: Config, one: Loop) -> WorstCase:
+def search_worst(config: Config, loop: Loop) -> WorstCase:
     """Return the worst case by gradients."""
     return worst_case(
-        one,
+        loop,
         over={path: (low, high) for path, low, high in config.box},
         metric="overshoot",
         solver=FixedStep(step=config.step, duration=config.duration),
@@ -78,16 +79,16 @@ def found(config: Config, one: Loop) -> WorstCase:
     )
 
 
-def corners(config: Config, one: Loop) -> tuple[float, dict[str, float]]:
+def corners(config: Config, loop: Loop) -> tuple[float, dict[str, float]]:
     """Greatest overshoot at the corners of the box, and where."""
     batch = grid({path: (low, high) for path, low, high in config.box})
     solver = FixedStep(step=config.step, duration=config.duration)
-    overshoot = np.asarray(jax.jit(lambda one: run_batch(one, batch, solver, BRAKING))(one).metrics["overshoot"])
+    overshoot = np.asarray(jax.jit(lambda loop: run_batch(loop, batch, solver, BRAKING))(loop).metrics["overshoot"])
     i = int(np.nanargmax(overshoot))
     return float(overshoot[i]), {path: float(column[i]) for path, column in batch.values.items()}
 
 
-def sampled(config: Config, one: Loop) -> dict[str, np.ndarray]:
+def draw_samples(config: Config, loop: Loop) -> dict[str, np.ndarray]:
     """Overshoot of random samples, uniform over the box, and where the worst lies."""
     low, high = np.array([ends[1:] for ends in config.box]).T
     u = jax.random.uniform(jax.random.key(config.seed), (config.samples, len(low)))
@@ -96,20 +97,20 @@ def sampled(config: Config, one: Loop) -> dict[str, np.ndarray]:
 
     def brake(point: Any) -> Any:
         values = {path: x for (path, _, _), x in zip(config.box, point, strict=True)}
-        done = measure(replace(one, values), solver, BRAKING)
-        return done.metrics["overshoot"], done.diverged
+        run = measure(replace(loop, values), solver, BRAKING)
+        return run.metrics["overshoot"], run.diverged
 
     overshoot, diverged = jax.jit(lambda x: jax.lax.map(brake, x, batch_size=config.block))(points)
     return {"points": np.asarray(points), "overshoot": np.asarray(overshoot), "diverged": np.asarray(diverged)}
 
 
-def proof(config: Config, one: Loop) -> Certificate:
+def proof(config: Config, loop: Loop) -> Certificate:
     """Return the certificate of the linear loop over the same box, down to the speed at which a run ends."""
-    lag, controller = config.box[3][0], one.controller
+    lag, controller = config.box[3][0], loop.controller
     assert lag == "actuator.time_constant"
     names = {"initial.speed": "speed"}
     over = {names.get(path, path): (low, high) for path, low, high in config.box}
-    over["speed"] = (float(one.stop.speed), over["speed"][1])  # pyright: ignore[reportAttributeAccessIssue]
+    over["speed"] = (float(loop.stop.speed), over["speed"][1])  # pyright: ignore[reportAttributeAccessIssue]
     model = SlipModel(actuator=Lag(time_constant=1e-3), sampling=Sampling(period=float(controller.period)))  # pyright: ignore[reportAttributeAccessIssue]
     if isinstance(controller.controller, StateFeedback):  # pyright: ignore[reportAttributeAccessIssue]
         system = polytope(model, over, grid=5)
@@ -117,23 +118,23 @@ def proof(config: Config, one: Loop) -> Certificate:
         wider = SpeedScaled(model=model, reference_speed=over["speed"][1])
         falls = (0.0, greatest_speed_fall(8.6, over["speed"][0], float(controller.period)))  # pyright: ignore[reportAttributeAccessIssue]
         system = polytope(wider, {**{f"model.{path}": ends for path, ends in over.items()}, "fall": falls}, grid=5)
-    return certify(feedback_gain(one, system.states), system, fastest=True)
+    return certify(feedback_gain(loop, system.states), system, fastest=True)
 
 
-def seen(config: Config, one: Loop) -> Run:
+def roll_out(config: Config, loop: Loop) -> Run:
     """Return the run with its trajectory."""
-    return rollout(one, FixedStep(step=config.step, duration=config.duration), BRAKING)
+    return rollout(loop, FixedStep(step=config.step, duration=config.duration), BRAKING)
 
 
-def figures(config: Config, worst: dict[str, WorstCase], those: dict[str, Loop], random: Any) -> dict[str, Any]:
+def figures(config: Config, worst: dict[str, WorstCase], controllers: dict[str, Loop], random: Any) -> dict[str, Any]:
     """Nominal and worst run of each controller, and how the random samples are distributed."""
-    figure, axes = plot.sheet(2, len(those), title="Nominal and worst case", size=(5.8, 3.1))
-    for i, (name, one) in enumerate(those.items()):
-        runs = {"nominal": seen(config, one), "worst case found": seen(config, worst[name].loop)}
+    figure, axes = plot.sheet(2, len(controllers), title="Nominal and worst case", size=(5.8, 3.1))
+    for i, (name, loop) in enumerate(controllers.items()):
+        runs = {"nominal": roll_out(config, loop), "worst case found": roll_out(config, worst[name].loop)}
         plot.draw_slip_lines(axes[i], {label: run.trajectory for label, run in runs.items()})
         axes[i].set_xlim(0, 0.5)
         plot.label_axes(axes[i], "time [s]", "slip [1]", name)
-        ax = axes[len(those) + i]
+        ax = axes[len(controllers) + i]
         ax.hist(100 * random[name]["overshoot"], bins=80, color=plot.COLOURS[5], log=True, label="random samples")
         ax.axvline(100 * worst[name].value, color=plot.COLOURS[1], label="worst found")
         plot.label_axes(ax, "overshoot [%]", "samples")
@@ -143,20 +144,20 @@ def figures(config: Config, worst: dict[str, WorstCase], those: dict[str, Loop],
 def main(config: Config | None = None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config = config or Config()
-    those, rows, worst, random, reports, at_corner = loops(), [], {}, {}, {}, {}
-    for name, one in those.items():
+    controllers, rows, worst, random, reports, at_corner = loops(), [], {}, {}, {}, {}
+    for name, loop in controllers.items():
         begun = time.perf_counter()
-        worst[name] = found(config, one)
+        worst[name] = search_worst(config, loop)
         seconds = time.perf_counter() - begun
-        random[name] = sampled(config, one)
-        at_corners, at_corner[name] = corners(config, one)
-        proved = proof(config, one)
+        random[name] = draw_samples(config, loop)
+        at_corners, at_corner[name] = corners(config, loop)
+        proved = proof(config, loop)
         greatest = float(np.nanmax(random[name]["overshoot"]))
         reports[name] = worst[name].report(proved.quadratically_stable)
         rows.append(
             {
                 "controller": name,
-                "nominal overshoot [%]": 100 * float(seen(config, one).metrics["overshoot"]),
+                "nominal overshoot [%]": 100 * float(roll_out(config, loop).metrics["overshoot"]),
                 "worst found [%]": 100 * worst[name].value,
                 f"worst of the {2 ** len(config.box)} corners [%]": 100 * at_corners,
                 f"worst of {config.samples} samples [%]": 100 * greatest,
@@ -171,11 +172,11 @@ def main(config: Config | None = None) -> dict[str, Any]:
     record.print_rows("The worst case in a box of five parameters", rows)
     for name, report in reports.items():
         print(f"{name}: {report}")
-    at = {name: {k: float(v) for k, v in one.values.items()} for name, one in worst.items()}
+    at = {name: {k: float(v) for k, v in loop.values.items()} for name, loop in worst.items()}
     results = {"table": rows, "reports": reports, "worst": at, "worst_corner": at_corner}
-    return record.experiment(config, results, figures(config, worst, those, random))
+    return record.experiment(config, results, figures(config, worst, controllers, random))
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main()
+    store_numbers(__file__, main(), tolerance=1e-3)
