@@ -6,22 +6,22 @@ from diffabs.host import interrupt as _interrupt
 
 _interrupt.end_early_on_interrupt()  # before JAX, whose import takes seconds
 
-from diffabs.core.loop import Loop as Loop
 from diffabs.core.pytree import arrays as arrays
 from diffabs.core.pytree import replace as replace
-from diffabs.engine.admissible import check as check
-from diffabs.engine.run import measure as measure
-from diffabs.engine.run import rollout as rollout
 from diffabs.engine.solve import Event as Event
 from diffabs.engine.solve import Solution as Solution
 from diffabs.engine.solve import solve as solve
 from diffabs.engine.solve import switches as switches
-from diffabs.engine.types import Adaptive as Adaptive
-from diffabs.engine.types import FixedStep as FixedStep
-from diffabs.engine.types import Run as Run
+from diffabs.engine.solvers import Adaptive as Adaptive
+from diffabs.engine.solvers import FixedStep as FixedStep
 from diffabs.host.exports import lazy_getattr as _lazy_getattr
+from diffabs.loop.admissible import check as check
 from diffabs.loop.batch import Batch as Batch
+from diffabs.loop.closed_loop import Loop as Loop
 from diffabs.loop.ensemble import run_batch as run_batch
+from diffabs.loop.result import Run as Run
+from diffabs.loop.run import measure as measure
+from diffabs.loop.run import rollout as rollout
 from diffabs.parts.plants import BrakeStart as BrakeStart
 from diffabs.scenario.defaults import balancing as balancing
 from diffabs.scenario.defaults import braking as braking

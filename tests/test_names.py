@@ -106,7 +106,7 @@ def things(tree):
                 yield name, node.lineno
 
 
-@killed_by("engine.types", "    comparison: shapes", "    which: shapes")
+@killed_by("engine.step.slides", "    comparison: shapes", "    which: shapes")
 @pytest.mark.parametrize("path", TREES, ids=str)
 def test_a_thing_has_the_name_of_a_thing(path):
     assert [f"{name}, line {line}" for name, line in things(TREES[path]) if name.strip("_") in FILLERS] == []

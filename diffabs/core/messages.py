@@ -120,6 +120,18 @@ class Sample(NamedTuple):
     command: Scalar  # output of the controller
     control: Scalar  # output of the actuator
 
+    def shown(self) -> "Shown":
+        """Return outputs and setpoint."""
+        return Shown(self.output, self.setpoint)
+
+    def leading(self) -> Scalar:
+        """Return the first output, whose error limits an adaptive step."""
+        return self.output[0]
+
+    def leading_scales(self) -> Scalar:
+        """Return the greater one of |first output| and |setpoint|."""
+        return jnp.maximum(jnp.abs(self.output[0]), jnp.abs(self.setpoint))
+
 
 class Ending(NamedTuple):
     """The end of a run.
@@ -144,10 +156,9 @@ class Shown(NamedTuple):
     output: PyTree
     setpoint: Scalar
 
-    @classmethod
-    def of(cls, sample: Sample) -> "Shown":
-        """Return outputs and setpoint of a `sample`."""
-        return cls(sample.output, sample.setpoint)
+    def shown(self) -> "Shown":
+        """Return all of it."""
+        return self
 
 
 class Segment(NamedTuple):
@@ -157,8 +168,8 @@ class Segment(NamedTuple):
     extrema, roots and integrals of the cubic are those of the run to the order of the method.
 
     Attributes:
-        start: Sample at the start, after the jumps there.
-        end: Sample at the end, before the jumps there.
+        start: `Sample` of a loop at the start, after the jumps there.
+        end: The same at the end, before the jumps there.
         h: Length [s].
         step: Step of the grid [s].
         shown_rates: Function that returns the rates of plant outputs and setpoint at both ends.
@@ -170,12 +181,12 @@ class Segment(NamedTuple):
             ends with that rate. With none, it is the straight line.
     """
 
-    start: Sample
-    end: Sample
+    start: Any
+    end: Any
     h: Scalar
     step: Scalar
-    shown_rates: Callable[[], tuple[Shown, Shown]]
-    sample_rates: Callable[[], tuple[Sample, Sample]]
+    shown_rates: Callable[[], tuple[Any, Any]]
+    sample_rates: Callable[[], tuple[Any, Any]]
     smooth: Bool = False
     within: tuple[PyTree, PyTree] = (True, True)
 
@@ -189,7 +200,7 @@ class Segment(NamedTuple):
 
     def shown_cubic(self, read: Callable[[Shown], Scalar]) -> Cubic:
         """Return the cubic of `read`(shown), a function of the plant outputs and the setpoint."""
-        ends = (Shown.of(self.start), Shown.of(self.end))
+        ends = (self.start.shown(), self.end.shown())
         first, last = (jax.tree.map(lambda rate: self.h * rate, rates) for rates in self.shown_rates())
         # The error of a step bounds a jump in the rates of the plant, so both of them are used. It does not see the
         # setpoint, whose rate may jump at the end of a step.
@@ -225,4 +236,4 @@ def resting_segment(sample: Sample, h: Scalar) -> Segment:
     """Return a segment of length h [s] in which nothing moves."""
     sample = jax.tree.map(jnp.asarray, sample)
     still = jax.tree.map(jnp.zeros_like, sample)
-    return Segment(sample, sample, h, h, lambda: (Shown.of(still), Shown.of(still)), lambda: (still, still))
+    return Segment(sample, sample, h, h, lambda: (still.shown(), still.shown()), lambda: (still, still))

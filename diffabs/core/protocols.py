@@ -17,7 +17,7 @@ A continuous PID, a sampled controller and a relay thus fit into one loop. No co
 a contract by its methods and attributes.
 
 A plant declares its outputs, a NamedTuple of signals with their `units`: a `BrakeOutput`, a `BalanceOutput`, or another
-one. The target refers to the first output. `engine/contracts` checks a loop before its first run. It refuses a part
+one. The target refers to the first output. `loop/contracts` checks a loop before its first run. It refuses a part
 that returns something else than its contract says, or that reads an output which the plant lacks.
 
 Optional methods or attributes of a part's class, beyond its contract:

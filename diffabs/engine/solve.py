@@ -3,7 +3,7 @@
     dy/dt = field(t, y, args),  y(t0) = y0
     where condition(t, y, args) falls through zero:  y <- reset(t, y, args), or the solution ends
 
-The engine of `run` makes the run of a `FieldLoop` in the time s = (t - t0)/(t1 - t0) from 0 to 1:
+The engine makes the run of a `FieldSystem` in the time s = (t - t0)/(t1 - t0) from 0 to 1:
 
     dy/ds = (t1 - t0) field(t0 + (t1 - t0) s, y, args)
 
@@ -38,17 +38,16 @@ from diffabs.core.compiling import is_traced
 from diffabs.core.cubic import Cubic
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.lanes import any_lane, select
-from diffabs.core.loop import LoopState, Margins, Signals
 from diffabs.core.numerics import invalidate
-from diffabs.core.protocols import Clock, Ending, Memory, Sample, Segment
+from diffabs.core.protocols import Clock, Ending, Memory, Objective, Segment
 from diffabs.core.pytree import canonical_dtypes, param, part, pytree, static
-from diffabs.core.types import AnyArray, Array, Bool, Numbers, Part, PyTree, Scalar
-from diffabs.engine.admissible import find_solver_faults
-from diffabs.engine.arguments import build_stepping
+from diffabs.core.types import AnyArray, Array, Bool, Int, Numbers, PyTree, Scalar
 from diffabs.engine.drive.deferred import run_deferred
 from diffabs.engine.drive.engine import resolve_request
 from diffabs.engine.drive.loops import log_run, round_up_capacity
-from diffabs.engine.run import RunCapacity, run_differentiable
+from diffabs.engine.drive.runs import RunCapacity, build_stepping, run_differentiable
+from diffabs.engine.hybrid import Margins
+from diffabs.engine.solvers import Adaptive, FixedStep, Solver, find_solver_faults
 from diffabs.engine.step.adaptive import AdaptiveStepping
 from diffabs.engine.step.attempt import Point
 from diffabs.engine.step.comparisons import SwitchedProgram
@@ -57,7 +56,6 @@ from diffabs.engine.step.inner_functions import HOST_CALLS, SEARCHSORTED
 from diffabs.engine.step.replay import log_attempt, log_capacity
 from diffabs.engine.step.status import RunStatus, end_unfinished
 from diffabs.engine.step.system import UNCONSTRAINED, build_system
-from diffabs.engine.types import Adaptive, FixedStep, Solver
 
 MAX_TIME_LOSS = 1e-4  # rounding of t0 and t1, as a fraction of the span
 MAX_EVENTS = 24  # kinds of events of a solution: the log of a run has one bit for each
@@ -183,11 +181,52 @@ class EventMemory(NamedTuple):
     ends: Scalar
 
 
-class FieldOutput(NamedTuple):
-    """The signals of a field: no first signal whose error would count, and the state."""
+class FieldState(NamedTuple):
+    """The state of a `FieldSystem`.
 
-    nothing: Scalar
+    Attributes:
+        y: State of the field.
+        events: Memory of its events, an `EventMemory`.
+    """
+
     y: PyTree
+    events: Any
+
+    def flow(self) -> PyTree:
+        """Return the state of the field."""
+        return self.y
+
+    def held(self) -> Any:
+        """Return the memory of the events."""
+        return self.events
+
+    def with_flow(self, flow: PyTree) -> "FieldState":
+        """Return the state with another state of the field."""
+        return self._replace(y=flow)
+
+
+class FieldSample(NamedTuple):
+    """Time, in units of the span, and state of a field."""
+
+    t: Scalar
+    y: PyTree
+
+    def shown(self) -> "FieldSample":
+        """Return all of it."""
+        return self
+
+    def leading(self) -> tuple[()]:
+        """Return nothing: the states' errors alone limit a step."""
+        return ()
+
+    leading_scales = leading
+
+
+class FieldSignals(NamedTuple):
+    """The signals of a field; nothing is recorded."""
+
+    sample: FieldSample
+    recorded: dict[str, PyTree]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,21 +272,8 @@ class FieldCode(NamedTuple):
 
 
 @pytree
-class FieldPlant:
-    """The plant of a `FieldLoop`: its state is the state of the field."""
-
-    def project(self, state: object) -> PyTree:
-        """Return the state."""
-        return state
-
-    def output(self, state: object) -> FieldOutput:
-        """Return the signals in a state."""
-        return FieldOutput(0.0, state)
-
-
-@pytree
-class FieldLoop:
-    """A field with its events, as the engine reads a loop (`core.loop.Loop`), in the time s."""
+class FieldSystem:
+    """A field with its events as a hybrid system (`hybrid.HybridSystem`), in the time s."""
 
     inputs: dict[str, PyTree] = part()
     """Pytree of y0, t0, t1, args, and the constants of the functions."""
@@ -255,7 +281,6 @@ class FieldLoop:
     """The functions."""
     times_per_event: int = static()
     """Number of times that are kept of each event."""
-    plant = FieldPlant()
     ticks, jumps, recorders = False, True, ()
 
     @property
@@ -277,55 +302,70 @@ class FieldLoop:
         """Whether there are events."""
         return bool(self.code.events)
 
-    def start(self) -> LoopState:
+    def start(self) -> FieldState:
         """Return the state at t0."""
         y0, zero = self.inputs["y0"], jnp.zeros_like(self.inputs["t0"])
         count = len(self.code.inner)
         none = jnp.zeros(count, zero.dtype)
         times = jnp.full((count, self.times_per_event), jnp.nan, zero.dtype)
-        held = EventMemory(none, times, none, zero - 1.0, zero, zero, zero)
-        return LoopState(y0, Memory(), Memory(), Memory((), held), Memory())
+        return FieldState(y0, EventMemory(none, times, none, zero - 1.0, zero, zero, zero))
 
-    def signals(self, t: Scalar, state: LoopState) -> Signals:
-        """Return the signals at the time `t` in units of the span, in `state`: nothing but the state of the field."""
-        zero = jnp.zeros_like(jnp.asarray(t))
-        sample = Sample(t, FieldOutput(zero, state.plant), *(5 * [zero]))
-        nothing: PyTree = ()
-        return Signals(sample, nothing, nothing, {})
+    def prepare_run(self) -> tuple["FieldSystem", dict[str, Objective]]:
+        """Return the system itself: nothing is computed before a run, and nothing else measured."""
+        return self, {}
 
-    def flow(self, t: Scalar, state: LoopState, signals: Signals) -> tuple[PyTree, ...]:
+    def join_state(self, flow: PyTree, held: EventMemory) -> FieldState:
+        """Return the state of these two parts."""
+        return FieldState(flow, held)
+
+    def project(self, state: FieldState) -> FieldState:
+        """Return the state: all are admissible."""
+        return state
+
+    def leading(self, state: FieldState) -> tuple[()]:
+        """Return nothing: the states' errors alone limit a step."""
+        del state
+        return ()
+
+    def next_tick(self, k: Int, h: Scalar) -> Int:
+        """Raise a TypeError: a field has no clock."""
+        raise TypeError(f"a field has no clock; asked for the tick after {k} on a grid of {h}")
+
+    def signals(self, t: Scalar, state: FieldState) -> FieldSignals:
+        """Return the signals at the time `t` in units of the span: time and state of the field."""
+        return FieldSignals(FieldSample(t, state.y), {})
+
+    def flow(self, t: Scalar, state: FieldState, signals: FieldSignals) -> PyTree:
         """Return d(state.flow())/ds; NaN after a fault, which ends the run."""
         del signals
-        rate = self._rate(t, state.plant)
+        rate = self._rate(t, state.y)
         if self.changes:
-            rate = select(
-                state.controller.held.fault > 0, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), rate), rate
-            )
-        return rate, (), (), (), ()
+            rate = select(state.events.fault > 0, jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), rate), rate)
+        return rate
 
-    def margins(self, t: Scalar, state: LoopState, signals: Signals, flow: Callable[[], PyTree]) -> Margins:
+    def margins(self, t: Scalar, state: FieldState, signals: FieldSignals, flow: Callable[[], PyTree]) -> Margins:
         """Return the conditions; those of terminal events belong to the stop."""
         del signals, flow
         stops = (
             jnp.ones_like(jnp.asarray(t)),
-            *(self._call(event.condition, t, state.plant) for event in self.code.terminal),
+            *(self._call(event.condition, t, state.y) for event in self.code.terminal),
         )
         if not self.changes:
             return {"stop": stops}
-        lifts = state.controller.held.lifts
+        lifts = state.events.lifts
         pairs = zip(self.code.inner, lifts, strict=True)
-        conditions = (self._call(event.condition, t, state.plant) + lift for event, lift in pairs)
+        conditions = (self._call(event.condition, t, state.y) + lift for event, lift in pairs)
         return {"events": tuple(conditions), "stop": stops}
 
     def change(
         self,
         clock: Clock,
-        state: LoopState,
-        before: Signals,
+        state: FieldState,
+        before: FieldSignals,
         margins: Margins,
         fired: Margins,
         passed: dict[str, PyTree] | None = None,
-    ) -> LoopState:
+    ) -> FieldState:
         """Return the state after the events that have `fired`; a reset may make a later event of the list happen."""
         del before
         if passed is None:  # the start, where no condition has fallen
@@ -337,9 +377,9 @@ class FieldLoop:
             lambda: state,
         )
 
-    def _change(self, t: Any, state: LoopState, margins: Margins, fired: Sequence[Bool]) -> LoopState:
+    def _change(self, t: Any, state: FieldState, margins: Margins, fired: Sequence[Bool]) -> FieldState:
         was, stops = margins["events"], margins["stop"][1:]
-        held = state.controller.held
+        held = state.events
 
         def apply_resets(t: Array, y: object) -> tuple[tuple[PyTree, list[Scalar]], list[Bool]]:
             """Return the state after the resets with all conditions there, and which events have happened."""
@@ -353,10 +393,10 @@ class FieldLoop:
                     y, moved = select(happens, self._call(event.reset, t, y), y), True
             return (y, [self._call(event.condition, t, y) for event in self.code.inner]), happened
 
-        follow = jnp.ones_like(t), self._rate(t, state.plant)
-        (y, after), (_, moves), happened = jax.jvp(apply_resets, (t, state.plant), follow, has_aux=True)
+        follow = jnp.ones_like(t), self._rate(t, state.y)
+        (y, after), (_, moves), happened = jax.jvp(apply_resets, (t, state.y), follow, has_aux=True)
         each = zip(self.code.inner, happened, fired, was, held.lifts, after, moves, strict=True)
-        lifts, faults = zip(*(self._arm(t, state.plant, y, *some) for some in each), strict=True)
+        lifts, faults = zip(*(self._arm(t, state.y, y, *some) for some in each), strict=True)
         events = jnp.stack(happened)
         now = jnp.arange(self.times_per_event) == held.counts[:, None]
         quick = jnp.where(t - held.last < LANDING_FRACTION, held.quick + 1.0, 0.0)
@@ -376,7 +416,7 @@ class FieldLoop:
             jnp.stack(lifts),
             *(last, quick, fault, ends),
         )
-        return state._replace(plant=y, controller=Memory((), jax.tree.map(lambda x: jnp.asarray(x, t.dtype), held)))
+        return FieldState(y, jax.tree.map(lambda x: jnp.asarray(x, t.dtype), held))
 
     def _arm(
         self,
@@ -441,7 +481,7 @@ class FieldLoop:
 
     def distance(self, condition: Callable, point: Point) -> Scalar:
         """Return the time from the end of a run to the zero of an event's condition, zero within rounding."""
-        t, y = jax.lax.stop_gradient((point.t, point.state.plant))
+        t, y = jax.lax.stop_gradient((point.t, point.state.flow()))
         margin, rate = self._follow(condition, t, y)
         away = jnp.where(rate < 0, jnp.abs(margin) / jnp.where(rate < 0, -rate, 1.0), jnp.inf)
         return jnp.where(away <= COINCIDENCE_FRACTION, 0.0, away)
@@ -461,14 +501,12 @@ class Saves:
     times: Array = param(unit="1", free=True)
     """The same in the time of the field, shape (n,)."""
 
-    def start(self, sample: Sample) -> Memory:
+    def start(self, sample: FieldSample) -> Memory:
         """Return the first state for each time."""
         count = len(self.places)
-        return Memory(
-            held=jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (count, *jnp.shape(x))), sample.output.y)
-        )
+        return Memory(held=jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (count, *jnp.shape(x))), sample.y))
 
-    def flow(self, memory: Memory, sample: Sample) -> PyTree:
+    def flow(self, memory: Memory, sample: FieldSample) -> PyTree:
         """Return no rates."""
         del memory, sample
         return ()
@@ -476,7 +514,7 @@ class Saves:
     def update(self, memory: Memory, segment: Segment) -> PyTree:
         """Return the states, with those in the step."""
         (start, end), rates = (segment.start, segment.end), segment.shown_rates()
-        first, last = (jax.tree.map(lambda rate: segment.h * rate, shown.output.y) for shown in rates)
+        first, last = (jax.tree.map(lambda rate: segment.h * rate, shown.y) for shown in rates)
         # Each time is overwritten from step to step up to the one in which it lies, so that an event on it is over.
         begun = jax.lax.stop_gradient(start.t) <= self.places + COINCIDENCE_FRACTION
         x = (self.places - start.t) / jnp.where(segment.h > 0, segment.h, 1.0)
@@ -487,7 +525,7 @@ class Saves:
             new = jax.vmap(Cubic(a, b, da, db))(x)
             return jnp.where(jnp.reshape(inside, (-1, *(jnp.ndim(a) * [1]))), new, old)
 
-        return jax.tree.map(keep, memory.held, start.output.y, end.output.y, first, last)
+        return jax.tree.map(keep, memory.held, start.y, end.y, first, last)
 
     def value(self, memory: Memory, ending: Ending) -> PyTree:
         """Return the states."""
@@ -579,12 +617,12 @@ def solve(
         raise ValueError(f"events has {len(events)} entries; at most {MAX_EVENTS} are possible")
     if isinstance(kept_events, bool) or not isinstance(kept_events, int | np.integer) or kept_events < 1:
         raise ValueError(f"kept_events = {kept_events!r} is no whole number of at least 1")
-    loop, save_objective = _build_loop(field, y0, t0, t1, args, events, save, int(kept_events))
+    system, save_objective = build_field(field, y0, t0, t1, args, events, save, int(kept_events))
     any_solver: Any = solver
-    method, count = _read_solver(any_solver, t0, t1, loop.inputs["t0"].dtype)
-    program = _trace_program(loop)
+    method, count = _read_solver(any_solver, t0, t1, system.inputs["t0"].dtype)
+    program = _trace_program(system)
     switched = bool(program.bit_count or events)
-    if switched and loop.inputs["t0"].dtype != jnp.float64:
+    if switched and system.inputs["t0"].dtype != jnp.float64:
         raise ValueError(
             "float32 cannot locate the switches and events of a field; call"
             ' jax.config.update("jax_enable_x64", True), and give float64 numbers'
@@ -595,10 +633,10 @@ def solve(
         method = dataclasses.replace(method, watches=False, smooth=True, **lean)
     saves = {} if save_objective is None else {"saves": save_objective}
 
-    room = count if isinstance(method, FixedStepping) else log_capacity(loop, any_solver)
-    capacity = RunCapacity(round_up_capacity(room), 0, 0, _finish_solution)
-    run = loop, saves, method, None
-    if engine == "kernel" or (engine == "auto" and is_traced(loop, saves)):
+    room = count if isinstance(method, FixedStepping) else log_capacity(system, any_solver)
+    capacity = RunCapacity(_finish_solution, None, round_up_capacity(room))
+    run = system, saves, method, None
+    if engine == "kernel" or (engine == "auto" and is_traced(system, saves)):
         return run_deferred(run_differentiable, capacity, run, required=engine == "kernel")
     return run_differentiable(capacity, run)
 
@@ -634,11 +672,11 @@ def switches(
     """
     if _is_traced(t, y, args, t1):
         raise ValueError("switches lists numbers of one run: call it outside of jit, vmap and grad")
-    loop, _ = _build_loop(field, y, t, float(t) + 1.0 if t1 is None else t1, args, (), None, 1)
-    program, zero = _trace_program(loop), jnp.zeros_like(loop.inputs["t0"])
-    system = build_system(loop, {}, zero, loop.start(), {}, switched=True)
-    surfaces = system.evaluate(zero, loop.start(), {}, UNCONSTRAINED).surfaces
-    flips = [] if t1 is None else _list_flips(loop, solver)
+    system, _ = build_field(field, y, t, float(t) + 1.0 if t1 is None else t1, args, (), None, 1)
+    program, zero = _trace_program(system), jnp.zeros_like(system.inputs["t0"])
+    observed = build_system(system, {}, zero, system.start(), {}, switched=True)
+    surfaces = observed.evaluate(zero, system.start(), {}, UNCONSTRAINED).surfaces
+    flips = [] if t1 is None else _list_flips(system, solver)
     comparisons = []
     for (first, shape), op in zip(program.places, program.origins, strict=True):
         bits = range(first, first + int(np.prod(shape)))
@@ -650,29 +688,29 @@ def switches(
     return comparisons
 
 
-def _list_flips(loop: Part, solver: Adaptive) -> list[tuple[float, int]]:
+def _list_flips(system: FieldSystem, solver: Adaptive) -> list[tuple[float, int]]:
     """Return time and number of each comparison that changes in a run."""
-    method, _ = _read_solver(solver, 0.0, 1.0, loop.inputs["t0"].dtype)
+    method, _ = _read_solver(solver, 0.0, 1.0, system.inputs["t0"].dtype)
     if not isinstance(method, AdaptiveStepping):
         raise ValueError(f"solver = {solver} has fixed steps; d.Adaptive is needed")
 
     @jax.jit
-    def run(loop: Part) -> PyTree:
+    def run(system: FieldSystem) -> PyTree:
         key: Any = None
-        start = method.start(loop, {}, key)
-        step, renew = partial(method.step, loop, {}, key), partial(method.renew, loop)
-        carry, log = log_run(step, renew, log_attempt, start, round_up_capacity(log_capacity(loop, solver)))
-        return _finish_solution(loop, {}, end_unfinished(carry))[0].status, log
+        start = method.start(system, {}, key)
+        step, renew = partial(method.step, system, {}, key), partial(method.renew, system)
+        carry, log = log_run(step, renew, log_attempt, start, round_up_capacity(log_capacity(system, solver)))
+        return _finish_solution(system, {}, end_unfinished(carry))[0].status, log
 
-    status, log = run(loop)
+    status, log = run(system)
     if status != SolutionStatus.FINISHED:
         raise ValueError(f"t1: the run has no end, its status is {SolutionStatus(int(status)).name}")
     lands = np.ravel(log.lands)
-    times = np.ravel(loop.time(log.t))
+    times = np.ravel(system.time(log.t))
     return [(float(times[i]), int(lands[i])) for i in np.flatnonzero(np.ravel(log.accepted) & (lands >= 0))]
 
 
-def _build_loop(
+def build_field(
     field: Field,
     y0: object,
     t0: Array,
@@ -682,7 +720,7 @@ def _build_loop(
     save: AnyArray | None,
     times_per_event: int,
 ) -> tuple[Any, Saves | None]:
-    """Return the field as a `FieldLoop`, and the objective of the times `save`."""
+    """Return the field as a `FieldSystem`, and the objective of the times `save`."""
     _read_times(t0, t1, save)
     _refuse_leaves("y0", y0)
     for path, leaf in jax.tree_util.tree_leaves_with_path(args):
@@ -704,8 +742,8 @@ def _build_loop(
             )
     dynamics, event_functions, constants = _read_functions(field, events, t0, y0, args)
     inputs = {"y0": y0, "t0": t0, "t1": t1, "args": args, "constants": constants}
-    loop = FieldLoop(inputs=inputs, code=FieldCode(dynamics, event_functions), times_per_event=times_per_event)
-    return loop, None if save is None else _place_saves(save, t0, t1)
+    system = FieldSystem(inputs=inputs, code=FieldCode(dynamics, event_functions), times_per_event=times_per_event)
+    return system, None if save is None else _place_saves(save, t0, t1)
 
 
 def _place_saves(save: AnyArray, t0: Scalar, t1: Scalar) -> Saves:
@@ -715,9 +753,9 @@ def _place_saves(save: AnyArray, t0: Scalar, t1: Scalar) -> Saves:
     return Saves(places=jnp.where(empty, at_end, (save - t0) / jnp.where(empty, 1.0, t1 - t0)), times=jnp.asarray(save))
 
 
-def _trace_program(loop: Part) -> SwitchedProgram:
-    """Return the program of the loop's flow, or raise a ValueError for a switch that no step can end on."""
-    program = build_system(loop, {}, jnp.zeros_like(loop.inputs["t0"]), loop.start(), {}, switched=True).program
+def _trace_program(system: FieldSystem) -> SwitchedProgram:
+    """Return the program of the field, or raise a ValueError for a switch that no step can end on."""
+    program = build_system(system, {}, jnp.zeros_like(system.inputs["t0"]), system.start(), {}, switched=True).program
     assert program is not None
     for worst in program.hidden:
         advice = next((text for names, text in REFUSAL_ADVICE if worst.function in names), REFUSAL_ADVICE[-1][1])
@@ -734,8 +772,8 @@ def _trace_program(loop: Part) -> SwitchedProgram:
     return program
 
 
-def _finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTree) -> tuple[Solution, None]:
-    point, held = carry.point, carry.point.state.controller.held
+def _finish_solution(system: FieldSystem, objectives: dict[str, Saves], carry: PyTree) -> tuple[Solution, None]:
+    point, held = carry.point, carry.point.state.events
     statuses = {
         RunStatus.TIMED_OUT: SolutionStatus.FINISHED,
         RunStatus.STOPPED: SolutionStatus.TERMINATED,
@@ -748,17 +786,17 @@ def _finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTre
     # A fault of an event ends the run by rates that are NaN. Fixed steps then leave their mode, as in a slide.
     lost: Scalar = ((status == SolutionStatus.DIVERGED) | (status == SolutionStatus.SLID)) & (held.fault > 0)
     status = jnp.where(lost, held.fault.astype(status.dtype), status)
-    check = partial(invalidate, invalid=status > SolutionStatus.TERMINATED, inputs=loop.inputs)
+    check = partial(invalidate, invalid=status > SolutionStatus.TERMINATED, inputs=system.inputs)
     # The sum of the steps of a grid may miss t1 by its rounding.
-    t = jnp.where(status == SolutionStatus.FINISHED, loop.inputs["t1"], loop.time(point.t))
-    y = point.state.plant
+    t = jnp.where(status == SolutionStatus.FINISHED, system.inputs["t1"], system.time(point.t))
+    y = point.state.y
     if objectives:
         t, places = objectives["saves"].times, objectives["saves"].places
         over = places > jax.lax.stop_gradient(point.t) - COINCIDENCE_FRACTION
         # At t1 the state moves with its own time. After a terminal event it is repeated.
-        late = jnp.where(over & (status == SolutionStatus.FINISHED), t - loop.time(point.t), 0.0)
+        late = jnp.where(over & (status == SolutionStatus.FINISHED), t - system.time(point.t), 0.0)
         late -= jax.lax.stop_gradient(late)
-        rates = loop.field(point.t, y)
+        rates = system.field(point.t, y)
         outside = jnp.where(jnp.abs(places - 0.5) <= 0.5 + COINCIDENCE_FRACTION, 1.0, jnp.nan)
 
         def pick(y: Array, rate: Array, saved: Array) -> Array:
@@ -767,27 +805,27 @@ def _finish_solution(loop: FieldLoop, objectives: dict[str, Saves], carry: PyTre
             return jnp.reshape(outside, shape) * jnp.where(jnp.reshape(over, shape), moved, saved)
 
         y = jax.tree.map(pick, y, rates, point.accumulators["saves"].held)
-    events = _count_events(loop, carry, status == SolutionStatus.TERMINATED)
-    times = check(loop.time(events.times))
+    events = _count_events(system, carry, status == SolutionStatus.TERMINATED)
+    times = check(system.time(events.times))
     return Solution(check(t), jax.tree.map(check, y), events._replace(times=times), status), None
 
 
-def _count_events(loop: FieldLoop, carry: PyTree, terminated: Bool) -> SolutionEvents:
+def _count_events(system: FieldSystem, carry: PyTree, terminated: Bool) -> SolutionEvents:
     """Return times, in units of the span, and counts of all events in their order."""
-    point, held = carry.point, carry.point.state.controller.held
-    distances = [loop.distance(event.condition, point) for event in loop.code.terminal]
+    point, held = carry.point, carry.point.state.events
+    distances = [system.distance(event.condition, point) for event in system.code.terminal]
     last = jnp.argmin(jnp.stack(distances)) if distances else 0
     last = jnp.where(held.ends > 0, held.ends - 1.0, last)
-    never = jnp.full(loop.times_per_event, jnp.nan, point.t.dtype)
-    inner, ends, rows = iter(range(len(loop.code.inner))), iter(range(len(distances))), []
-    for event in loop.code.events:
+    never = jnp.full(system.times_per_event, jnp.nan, point.t.dtype)
+    inner, ends, rows = iter(range(len(system.code.inner))), iter(range(len(distances))), []
+    for event in system.code.events:
         if event.terminal:
             happens = jnp.asarray(terminated & (last == next(ends)))
             rows.append((jnp.where(happens, never.at[0].set(point.t), never), happens.astype(point.t.dtype)))
         else:
             i = next(inner)
             rows.append((held.times[i], held.counts[i]))
-    times = jnp.stack([time for time, _ in rows]) if rows else jnp.zeros((0, loop.times_per_event), point.t.dtype)
+    times = jnp.stack([time for time, _ in rows]) if rows else jnp.zeros((0, system.times_per_event), point.t.dtype)
     counts = jnp.stack([count for _, count in rows]) if rows else jnp.zeros(0, point.t.dtype)
     return SolutionEvents(times, counts.astype(int))
 

@@ -22,7 +22,6 @@ from jax.flatten_util import ravel_pytree
 
 from diffabs.core.blocks import Direct, Series, offers
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.tracing import depends_on_signal
@@ -32,6 +31,7 @@ from diffabs.linear.linearization import check_kink, coordinate_moves, independe
 from diffabs.linear.operating_point import MAX_REST_RESIDUE, find_root
 from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer, check_transfer
 from diffabs.linear.zero_order_hold import hold_input
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.actuators import Delay
 from diffabs.parts.controllers import Sampled
 

@@ -19,11 +19,11 @@ from jax.flatten_util import ravel_pytree
 
 from diffabs.core.blocks import Direct, NoFeedforward
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Feedforward, Memory, Plant, Reference, Tracking
 from diffabs.core.pytree import canonical_dtypes, part, pytree, static
 from diffabs.core.types import AnyArray, Array, Bool, Matrix, Part, PyTree, Scalar
 from diffabs.linear.linearization import StateSpace, check_kink, is_kinked, nan_at_kink
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.stops import NoStop
 
 ROOT_ITERATIONS = 10  # Gauss-Newton iterations to the point of rest; one is enough where the loop is linear

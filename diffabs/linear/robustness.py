@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace
 from diffabs.core.shapes import Float
 from diffabs.core.types import JsonObject, Scalar
 from diffabs.linear.opened_loop import OpenLoop, open_loop
 from diffabs.linear.stability_margins import Margins, margins
+from diffabs.loop.closed_loop import Loop
 
 MAX_BAND_CORNERS = 2**10
 

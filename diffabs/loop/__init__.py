@@ -1,8 +1,9 @@
-"""Many runs of a closed loop: batches, their runs by the fastest engine, and estimates of the error.
+"""The closed loop: a hybrid system of plant, controller and the blocks around them, its runs, batches and errors.
 
-The ring imports `engine` and what is below it.
+`closed_loop` is the system, `run` makes one run and `ensemble` many, `result` judges them. The ring imports `parts`,
+`engine` and what is below them.
 
-Read first: `batch.py`, `ensemble.py`, `accuracy.py`.
+Read first: `closed_loop.py`, `run.py`, `ensemble.py`.
 """
 
 from typing import TYPE_CHECKING
@@ -12,5 +13,7 @@ from diffabs.host.exports import lazy_getattr
 if TYPE_CHECKING:
     from diffabs.loop.batch import Batch as Batch
     from diffabs.loop.ensemble import run_batch as run_batch
+    from diffabs.loop.run import measure as measure
+    from diffabs.loop.run import rollout as rollout
 
 __getattr__ = lazy_getattr(__name__)

@@ -21,12 +21,13 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.blocks import offers
-from diffabs.core.loop import BLOCKS, Loop
 from diffabs.core.protocols import Clock, Memory, Objective
 from diffabs.core.pytree import refine_parts
 from diffabs.core.types import Bool, Int, Key, Part, PyTree, Scalar, Vector
-from diffabs.engine.run import measure
-from diffabs.engine.types import Run, Solver, refine_solver
+from diffabs.engine.solvers import Solver, refine_solver
+from diffabs.loop.closed_loop import BLOCKS, Loop
+from diffabs.loop.result import Run
+from diffabs.loop.run import measure
 
 MAX_DIFFERENCE_RATIO = 0.75  # greatest |d2/d1| of a convergent metric: an order of 0.4
 ROUNDING_EPS = 1e3  # multiples of machine epsilon: smaller differences count as rounding errors

@@ -14,8 +14,8 @@ from diffabs.core import kinds, shapes
 from diffabs.core.pytree import canonical_dtypes, get, parameters, replace, stack_lists
 from diffabs.core.summary import Summary
 from diffabs.core.types import AnyArray, Params, Part, PyTree
-from diffabs.engine.admissible import first_refusal
-from diffabs.engine.types import Solver
+from diffabs.engine.solvers import Solver
+from diffabs.loop.admissible import first_refusal
 
 MAX_LENGTH_RATIO = 2.0  # runs in one group differ by less than this factor in duration
 

@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping
 import jax
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.summary import format_metric
 from diffabs.core.types import JsonObject, Key, Params
-from diffabs.engine.admissible import MAX_SOLVER_STEPS
-from diffabs.engine.run import run_unchecked
-from diffabs.engine.types import Adaptive, Run, Solver, describe_solver, differs_in_kind, refine_solver
+from diffabs.engine.solvers import MAX_SOLVER_STEPS, Adaptive, Solver, describe_solver, refine_solver
 from diffabs.loop.accuracy import estimate_accuracy, incomparability_reasons, needs_key
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.result import Run, differs_in_kind
+from diffabs.loop.run import run_unchecked
 
 MIN_CHANGE = 1e-6  # of a value; the order of a smaller error does not matter
 ROUNDING = 1e-12  # in the metric's unit; a smaller error of a value near 0 is rounding

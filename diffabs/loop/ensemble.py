@@ -13,19 +13,20 @@ import numpy as np
 from diffabs.core import kinds
 from diffabs.core.compiling import is_traced
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import get, replace
-from diffabs.core.types import Array, Bool, Key, PyTree
-from diffabs.engine.admissible import batch_admissibility, find_impossible_values, find_unstable_step
-from diffabs.engine.arguments import refuse, refuse_unnamed
+from diffabs.core.pytree import canonical_dtypes, get, replace
+from diffabs.core.types import Array, Bool, Key, Params, PyTree
 from diffabs.engine.drive.engine import check_process, resolve_request, run_with_engine
 from diffabs.engine.drive.packed import EarlyEnd, run_packed
 from diffabs.engine.drive.sharding import describe_placement, run_on_all_cores, run_on_auto_mesh
-from diffabs.engine.faults import Fault
-from diffabs.engine.run import run_unchecked
-from diffabs.engine.types import Run, Solver
+from diffabs.engine.solvers import Solver
+from diffabs.loop.admissible import batch_admissibility, find_impossible_values, find_unstable_step
+from diffabs.loop.arguments import forbid_derivatives, prepare_arguments, refuse, refuse_unnamed
 from diffabs.loop.batch import Batch
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.faults import Fault
+from diffabs.loop.result import Run, finish_run
+from diffabs.loop.run import run_unchecked
 
 log: logging.Logger = logging.getLogger("diffabs")
 # Part of a message: why a batch cannot run in a kernel.
@@ -160,14 +161,8 @@ def _dispatch_batch(
             _warn_refused(count, count, lines[0])
     elif np.shape(accepted) not in ((), (count,)):
         raise ValueError(f"accepted has shape {np.shape(accepted)}; ({count},) is needed, one value for each run")
-    arguments = (
-        loop,
-        batch.values,
-        batch._keys(),
-        solver,
-        objectives,
-        jnp.broadcast_to(jnp.asarray(accepted, bool), count),
-    )
+    keys, flags = batch._keys(), jnp.broadcast_to(jnp.asarray(accepted, bool), count)
+    arguments = loop, batch.values, keys, solver, objectives, flags
     as_one = trajectories or (live if together is None else together) or (not batch.values and batch.keys is None)
     if as_one and enough is not None:
         raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
@@ -179,24 +174,49 @@ def _dispatch_batch(
     def by_kernel() -> Run:
         from diffabs.engine.drive.kernel import run_native
 
-        return run_native(*arguments, enough)
+        prepared, values, method, measured = _prepare_batch(loop, batch.values, solver, objectives)
+        return run_native(prepared, values, keys, method, measured, flags, finish_run, enough)
 
     def by_xla() -> Run:
         if not as_one:
-            everything = arguments[1], arguments[2], arguments[-1]  # values, keys, accepted
+            columns = batch.values, keys, flags
 
             def run(columns: PyTree, numbers: Array) -> Run:
                 values, keys, accepted = columns
-                return run_packed(loop, values, keys, solver, objectives, accepted, enough, numbers)
+                prepared, values, method, measured = _prepare_batch(loop, values, solver, objectives)
+                return run_packed(prepared, values, keys, method, measured, accepted, finish_run, enough, numbers)
 
             if traced:
-                return run(everything, jnp.arange(count))
-            return run_on_all_cores(run, everything, count)
+                return run(columns, jnp.arange(count))
+            return run_on_all_cores(run, columns, count)
         return _mark_refused(_run_vmapped(loop, batch, solver, objectives, trajectories, "xla"), accepted)
 
     why_not = TOGETHER_REASON if trajectories or together else ""
     why_xla = TRACED_REASON if traced else TOGETHER_REASON if as_one else describe_placement(arguments)
     return run_with_engine(engine, by_kernel, by_xla, (arguments, enough), why_not, why_xla)
+
+
+def _prepare_batch(
+    loop: Loop, values: Params, solver: Solver, objectives: Mapping[str, Objective]
+) -> tuple[Loop, Params, PyTree, PyTree]:
+    """Return loop, values (runs, ...), stepping method and objectives of one data type, as the engine needs them."""
+    loop, measured, method = prepare_arguments(loop, solver, objectives)
+    columns = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
+    return loop, {**columns, **forbid_derivatives(loop, columns)}, method, measured
+
+
+def kernel_objection(loop: Loop, values: Params, solver: Solver, objectives: Mapping[str, Objective]) -> str | None:
+    """Return one line with the reason why a kernel cannot make these runs, or None if it can.
+
+    A reason is an operation without a translation, no compiler on this machine, or traced numbers. The function
+    executes no run, but it compiles and keeps the kernel. `values` have at least one path, with columns (runs, ...).
+    """
+    from diffabs.engine.drive.kernel import find_objection
+
+    if is_traced(loop, dict(values), dict(objectives)):
+        return "this is traced; ask with numbers"
+    prepared, columns, method, measured = _prepare_batch(loop, values, solver, objectives)
+    return find_objection(prepared, columns, method, dict(measured), finish_run)
 
 
 _warn_refused = functools.cache(functools.partial(log.warning, "%d of %d runs are refused and count as diverged: %s"))

@@ -15,17 +15,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.numerics import spectral_bound
 from diffabs.core.pytree import replace
 from diffabs.core.types import AnyArray, JsonObject, Part, PyTree, Table
-from diffabs.engine.run import rollout
-from diffabs.engine.types import Adaptive, FixedStep, Run, describe_solver
+from diffabs.engine.solvers import Adaptive, FixedStep, describe_solver
 from diffabs.host import provenance
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.linearization import StateSpace
 from diffabs.linear.recoverable import mode_bounds, transmission_zeros
 from diffabs.linear.regulator import lqr
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.result import Run
+from diffabs.loop.run import rollout
 from diffabs.papers import arm_equations, arm_figures, record
 from diffabs.papers.digest import Digest, Refuted, digest
 from diffabs.parts.controllers import BalanceFeedback

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.types import JsonObject, PyTree
-from diffabs.engine.types import Run
 from diffabs.linear.recoverable import mode_bounds
+from diffabs.loop.result import Run
 from diffabs.output import plot
 from diffabs.robust.design.attraction import Basin, Reach
 

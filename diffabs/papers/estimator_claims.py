@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from diffabs.core.types import JsonObject, Table
-from diffabs.engine.types import Run
+from diffabs.loop.result import Run
 from diffabs.papers import record
 from diffabs.parts.roads import peak
 

@@ -15,11 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.blocks import Direct
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import get, param, part, pytree
 from diffabs.core.types import JsonObject, Params, Scalar, Table, Vector
-from diffabs.engine.types import FixedStep, Run
+from diffabs.engine.solvers import FixedStep
 from diffabs.host import provenance
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.result import Run
 from diffabs.output import plot
 from diffabs.papers import record
 from diffabs.papers.digest import Digest

@@ -21,13 +21,13 @@ from typing import Any, cast
 import jax
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Table
 from diffabs.core.units import resolve_unit, units_of
-from diffabs.engine.run import run_unchecked
-from diffabs.engine.types import Run
 from diffabs.host import files, provenance
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.result import Run
+from diffabs.loop.run import run_unchecked
 from diffabs.output import plot
 from diffabs.papers import record
 from diffabs.papers.digest import Digest

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.types import JsonObject
-from diffabs.engine.types import Run
 from diffabs.linear.slip_model import SlipModel
+from diffabs.loop.result import Run
 from diffabs.output import plot
 from diffabs.papers import record
 from diffabs.papers.digest import Refuted

@@ -21,13 +21,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import param, part, pytree, replace
 from diffabs.core.types import JsonObject, Params, Scalar, Vector
-from diffabs.engine.run import run_unchecked
-from diffabs.engine.types import FixedStep, Run
+from diffabs.engine.solvers import FixedStep
 from diffabs.host import files
 from diffabs.host.values import ScenarioError
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.result import Run
+from diffabs.loop.run import run_unchecked
 from diffabs.parts.actuators import DeadTime
 from diffabs.parts.controllers import ConstantTorque, PlayedCommand, Relay, Sampled
 from diffabs.parts.plants import BrakeStart, LabRig

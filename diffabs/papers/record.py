@@ -14,8 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 from diffabs.core.types import JsonObject, Params, Scalar
-from diffabs.engine.types import FixedStep, Run
+from diffabs.engine.solvers import FixedStep
 from diffabs.host import documents, files, provenance
+from diffabs.loop.result import Run
 from diffabs.output import plot
 from diffabs.papers.digest import Digest
 

@@ -13,14 +13,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Reference
 from diffabs.core.types import JsonObject, Table
-from diffabs.engine.run import rollout, run_unchecked
-from diffabs.engine.types import FixedStep, Run
+from diffabs.engine.solvers import FixedStep
 from diffabs.host import provenance
 from diffabs.loop.batch import stack_loops
+from diffabs.loop.closed_loop import Loop
 from diffabs.loop.ensemble import run_batch
+from diffabs.loop.result import Run
+from diffabs.loop.run import rollout, run_unchecked
 from diffabs.output import plot
 from diffabs.papers import estimator_claims, record
 from diffabs.papers.digest import Digest, Refuted, digest

@@ -14,13 +14,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.types import JsonObject, Table
-from diffabs.engine.run import rollout
-from diffabs.engine.types import FixedStep, Run, Trajectory
+from diffabs.engine.solvers import FixedStep
 from diffabs.host import provenance
 from diffabs.loop.batch import stack_loops
+from diffabs.loop.closed_loop import Loop
 from diffabs.loop.ensemble import run_batch
+from diffabs.loop.result import Run, Trajectory
+from diffabs.loop.run import rollout
 from diffabs.output import plot
 from diffabs.papers import lmi_claims, lmi_design, record
 from diffabs.papers.digest import Digest, digest

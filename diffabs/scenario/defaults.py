@@ -1,7 +1,7 @@
 """The usual loops, from which a scenario or an example starts: a braking car, a balanced two-wheeler."""
 
-from diffabs.core.loop import Loop
 from diffabs.core.types import Part
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.plants import ArmBalance, QuarterCar
 
 

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.core.loop import LOOP_SIGNALS
 from diffabs.host import files, separated
 from diffabs.host.values import ScenarioError, format_given, unknown_name_error
+from diffabs.loop.closed_loop import LOOP_SIGNALS
 
 MAX_MEASUREMENT_BYTES = 100_000_000  # bytes
 TIME_COLUMN = "t [s]"

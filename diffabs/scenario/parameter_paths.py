@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import JsonObject, PyTree, Table
@@ -39,6 +38,7 @@ from diffabs.host.values import (
     unknown_name_error,
     wrong_kind_error,
 )
+from diffabs.loop.closed_loop import Loop
 from diffabs.scenario.registry import KMH, MAX_DEPTH, in_kmh
 from diffabs.scenario.toml import parse_value
 

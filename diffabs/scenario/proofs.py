@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.types import JsonObject
-from diffabs.engine.types import Solver
+from diffabs.engine.solvers import Solver
 from diffabs.host import documents, files
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.objectives import default_objectives
 from diffabs.robust.design.verify import MAX_SECONDS, ClaimVerdict, verify_file
 from diffabs.robust.reach.certificate import certificate_document

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from diffabs.core import blocks, protocols
-from diffabs.core.loop import Loop
 from diffabs.core.meanings import field_meanings
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
@@ -36,6 +35,7 @@ from diffabs.host.values import (
     unknown_name_error,
     wrong_kind_error,
 )
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts import actuators, controllers, objectives, plants, references, roads, sensors, stops
 from diffabs.scenario import outside
 from diffabs.scenario.defaults import braking

@@ -24,15 +24,12 @@ import jax
 import numpy as np
 
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import get
 from diffabs.core.types import JsonObject, Table
 from diffabs.core.units import units_of
 from diffabs.core.validity import find_cautions, find_problems
-from diffabs.engine.admissible import find_mismatches, find_unstable_step
-from diffabs.engine.contracts import find_misfits
-from diffabs.engine.types import Adaptive, Solver
+from diffabs.engine.solvers import Adaptive, Solver
 from diffabs.host import files
 from diffabs.host.values import ScenarioError as ScenarioError
 from diffabs.host.values import (
@@ -44,6 +41,9 @@ from diffabs.host.values import (
     unknown_name_error,
     wrong_kind_error,
 )
+from diffabs.loop.admissible import find_mismatches, find_unstable_step
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.contracts import find_misfits
 from diffabs.parts.objectives import BRAKING, default_objectives
 from diffabs.scenario import parameter_paths, section_design, section_solver, section_sweep, section_tune, toml
 from diffabs.scenario.defaults import braking

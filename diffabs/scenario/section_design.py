@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.blocks import Series
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import JsonObject, Matrix, Scalar
 from diffabs.host.values import (
@@ -33,6 +32,7 @@ from diffabs.host.values import (
 )
 from diffabs.host.values import read_table as read_table
 from diffabs.linear.slip_model import SlipModel
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.actuators import Lag, RateLimit
 from diffabs.parts.controllers import Sampled
 from diffabs.scenario.parameter_paths import canonical_path, interval_table, read_entries

@@ -8,8 +8,7 @@ from collections.abc import Mapping
 
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject
-from diffabs.engine.admissible import MAX_SOLVER_STEPS
-from diffabs.engine.types import SOLVER_TYPES, Adaptive, FixedStep, Solver
+from diffabs.engine.solvers import MAX_SOLVER_STEPS, SOLVER_TYPES, Adaptive, FixedStep, Solver
 from diffabs.host.values import plain_fields, range_reader, read_one, read_switch, table_field, whole_reader
 
 TIME_SPEC = ParameterSpec("s", low=0.0, open_low=True)

@@ -29,7 +29,6 @@ import pathlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, elements, get
 from diffabs.core.types import JsonObject, Params, PyTree, Table
@@ -49,6 +48,7 @@ from diffabs.host.values import (
     wrong_kind_error,
 )
 from diffabs.host.values import read_table as read_table
+from diffabs.loop.closed_loop import Loop
 from diffabs.scenario.parameter_paths import (
     ParameterEntry,
     flatten_table,

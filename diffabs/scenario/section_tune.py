@@ -29,7 +29,6 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import JsonObject, Table
@@ -45,6 +44,7 @@ from diffabs.host.values import (
 )
 from diffabs.host.values import read_table as read_table
 from diffabs.loop.batch import Batch, grid, latin
+from diffabs.loop.closed_loop import Loop
 from diffabs.scenario.parameter_paths import (
     Ends,
     ParameterEntry,

@@ -10,8 +10,8 @@ from typing import Protocol
 
 import jax.numpy as jnp
 
-from diffabs.core.loop import Loop
 from diffabs.core.types import Params, PyTree, Scalar
+from diffabs.loop.closed_loop import Loop
 from diffabs.robust.design.interior.decay_rate import certified_decay
 from diffabs.robust.design.polytopes import Polytope
 from diffabs.robust.design.state_feedback import feedback_gain

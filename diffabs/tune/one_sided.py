@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace, stack_lists
 from diffabs.core.types import Params, Part, PyTree
-from diffabs.engine.types import FixedStep, Solver
+from diffabs.engine.solvers import FixedStep, Solver
 from diffabs.loop.batch import Batch
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.actuators import Delay
 from diffabs.parts.controllers import ConstantInput, NoFeedforward, Relay, SampledOnGrid, SlidingMode
 from diffabs.tune.result import build_subject_loop

@@ -20,15 +20,16 @@ import numpy as np
 
 from diffabs.core.bijectors import FreeSpace
 from diffabs.core.compiling import SAME_RESULT_OPTIONS
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import AnyArray, Array, Bool, Int, Part, PyTree, Scalar, Vector
-from diffabs.engine.admissible import batch_admissibility, first_refusal
 from diffabs.engine.drive.deferred import MANY_INPUTS_REASON, find_kernels
-from diffabs.engine.types import Run, Solver
+from diffabs.engine.solvers import Solver
+from diffabs.loop.admissible import batch_admissibility, first_refusal
 from diffabs.loop.batch import Batch
+from diffabs.loop.closed_loop import Loop
 from diffabs.loop.ensemble import run_batch
+from diffabs.loop.result import Run
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.method import DerivativeMode
 from diffabs.tune.result import build_subject_loop

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.reason import Reason
 from diffabs.core.summary import Summary
 from diffabs.core.types import Part, PyTree
+from diffabs.loop.closed_loop import Loop
 from diffabs.tune.method import DerivativeMode
 
 

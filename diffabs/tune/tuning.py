@@ -8,17 +8,17 @@ import numpy as np
 from diffabs.core.bijectors import FreeSpace, Range, parameter_space
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.kinds import find_value_objection, format_value, value_shape
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, get, replace
 from diffabs.core.tracing import used_inputs
 from diffabs.core.types import Params, PyTree
 from diffabs.core.validity import check_part
-from diffabs.engine.arguments import refuse
 from diffabs.engine.drive.engine import resolve_request
-from diffabs.engine.types import Solver
+from diffabs.engine.solvers import Solver
 from diffabs.host.interactive import ProgressLine, report_to
+from diffabs.loop.arguments import refuse
 from diffabs.loop.batch import Batch
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.objectives import default_objectives
 from diffabs.tune import one_sided
 from diffabs.tune.augmented_lagrangian import AugmentedLagrangianSearch

@@ -15,11 +15,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import param, part, pytree, replace, static
 from diffabs.core.types import AnyArray, Part, PyTree, Scalar, Vector
 from diffabs.linear.regulator import dlqr, lqr
 from diffabs.linear.weights import as_weight_matrix
+from diffabs.loop.closed_loop import Loop
 from diffabs.robust.design.interior.differentiable import robust_gain
 from diffabs.robust.design.polytopes import Polytope
 

@@ -28,18 +28,19 @@ from scipy.stats import qmc
 from diffabs.core.bijectors import FreeSpace, Range, parameter_space
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.kinds import format_value
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters, replace
 from diffabs.core.reason import Reason
 from diffabs.core.types import Part, PyTree
 from diffabs.core.units import units_of
 from diffabs.core.validity import check_part
-from diffabs.engine.admissible import first_refusal
 from diffabs.engine.drive.engine import describe_engine
-from diffabs.engine.types import Run, Solver
+from diffabs.engine.solvers import Solver
+from diffabs.loop.admissible import first_refusal
 from diffabs.loop.batch import Batch
+from diffabs.loop.closed_loop import Loop
 from diffabs.loop.ensemble import run_batch
+from diffabs.loop.result import Run
 from diffabs.parts.objectives import default_objectives
 from diffabs.tune.descent import Descent, DescentState, lbfgs
 from diffabs.tune.method import DerivativeMode, Stopping

@@ -33,9 +33,9 @@ from scipy.optimize import minimize
 
 from diffabs import Batch, FixedStep, Loop
 from diffabs.core.pytree import replace
-from diffabs.engine.run import rollout
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import recoverable_bound
+from diffabs.loop.run import rollout
 from diffabs.output import plot
 from diffabs.papers import record
 from diffabs.parts.objectives import BALANCE, SoftLoss

@@ -18,8 +18,8 @@ import jax
 import numpy as np
 
 from diffabs import Batch, FixedStep, run_batch
-from diffabs.core.loop import Loop
 from diffabs.linear.gaussian import lqg
+from diffabs.loop.closed_loop import Loop
 from diffabs.output import plot
 from diffabs.papers import record
 from diffabs.parts.objectives import SoftLoss

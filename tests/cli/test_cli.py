@@ -28,8 +28,8 @@ import diffabs
 from diffabs.cli import main
 from diffabs.core.protocols import Sample
 from diffabs.core.pytree import parameters
-from diffabs.engine.convert import write_csv
-from diffabs.engine.stability import stable_step
+from diffabs.loop.convert import write_csv
+from diffabs.loop.stability import stable_step
 from diffabs.parts.objectives import BRAKING
 from diffabs.scenario import model, registry, scenario, simulation
 
@@ -101,9 +101,7 @@ def test_metrics_are_the_reference_numbers(whole):
     assert metrics["locked_time"] == 0.0
 
 
-@killed_by(
-    "engine.convert", 'csv.writer(file, lineterminator="\\n").writerow(columns)', 'file.write(",".join(columns))'
-)
+@killed_by("loop.convert", 'csv.writer(file, lineterminator="\\n").writerow(columns)', 'file.write(",".join(columns))')
 def test_a_unit_with_a_comma_is_one_column(tmp_path):
     unit, numbers = 'deg, of the "wheel"', np.arange(2.0)
     plant, shows = types.SimpleNamespace(control_unit="V"), collections.namedtuple("Output", ["angle"])

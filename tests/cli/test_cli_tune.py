@@ -26,7 +26,7 @@ import diffabs.tune as library
 from diffabs.cli import console, progress
 from diffabs.cli import tune as commands_tune
 from diffabs.core.pytree import parameters, replace
-from diffabs.engine.run import measure
+from diffabs.loop.run import measure
 from diffabs.robust.design.sdp import solver
 from diffabs.scenario import proving, tuning
 from diffabs.scenario.proving import Proved

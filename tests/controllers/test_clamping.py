@@ -9,7 +9,7 @@ from signals import close, seen
 
 import diffabs as d
 from diffabs.core.protocols import Clock, Memory, Tracking
-from diffabs.engine.admissible import batch_admissibility
+from diffabs.loop.admissible import batch_admissibility
 from diffabs.parts.controllers import PID, Clamping, Sampled
 from diffabs.parts.objectives import IAE
 
@@ -67,7 +67,7 @@ def test_a_sampled_controller_uses_its_period():
     close(after.flow.integral, 0.16 + 0.05 * 0.5 - 0.1 / 10.0)
 
 
-@killed_by("engine.stability", "jnp.maximum(rates, drain)", "rates")
+@killed_by("loop.stability", "jnp.maximum(rates, drain)", "rates")
 def test_a_step_too_long_for_the_tracking_time_is_refused():
     loop = sliding.limited_pi(Clamping(tracking_time=0.01))
     with pytest.raises(ValueError, match=r"solver.step = 0.03 s is not stable.*\(0, 0.0278\] s"):

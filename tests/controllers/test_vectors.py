@@ -8,7 +8,7 @@ import pytest
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.engine.contracts import find_misfits
+from diffabs.loop.contracts import find_misfits
 from diffabs.parts.objectives import IAE
 from diffabs.parts.plants import QuarterCar
 

@@ -280,8 +280,8 @@ def test_the_integral_of_an_error_that_changes_sign(h):
 @pytest.mark.slow
 @killed_by(
     "core.messages",
-    "Shown.of(self.start), Shown.of(self.end)",
-    "Shown.of(self.start), Shown.of(self.end)._replace(setpoint=self.start.setpoint)",
+    "self.start.shown(), self.end.shown()",
+    "self.start.shown(), self.end.shown()._replace(setpoint=self.start.setpoint)",
 )
 @killed_by(
     "core.messages",
@@ -432,7 +432,7 @@ def test_latch_does_not_move_for_rounding():
     close(target, [0.2] * 3 + [0.1022] * 5, rtol=1e-9)
 
 
-@killed_by("core.loop", "((a >= 0) & ((b < 0) | (c < 0)))", "((a >= 0) & (c < 0))")
+@killed_by("loop.closed_loop", "((a >= 0) & ((b < 0) | (c < 0)))", "((a >= 0) & (c < 0))")
 @pytest.mark.slow
 def test_a_noisy_sampled_accelerometer_latches_on_a_drop():
     """a = 3 + 50 t + noise that is held for 2 steps: a jump down from more than ever is a maximum, wherever it goes to,

@@ -100,8 +100,8 @@ def usual():
 
 @pytest.mark.slow
 @killed_by("engine.drive.sharding", "with default_flags(), jax.enable_x64", "with jax.enable_x64")
-@killed_by("engine.run", "@default_flags()\ndef measure(", "def measure(")
-@killed_by("engine.run", "@default_flags()\ndef rollout(", "def rollout(")
+@killed_by("loop.run", "@default_flags()\ndef measure(", "def measure(")
+@killed_by("loop.run", "@default_flags()\ndef rollout(", "def rollout(")
 def test_loops_compute_the_same(strict, usual):
     jax.clear_caches()  # a traced program keeps the flags of its trace
     jax.tree.map(np.testing.assert_array_equal, run_all(), usual)

@@ -13,11 +13,11 @@ from marks import cases
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.core.loop import Loop
 from diffabs.core.numerics import quotient, searchsorted
 from diffabs.core.pytree import param, pytree, static
 from diffabs.engine.step.comparisons import SwitchedProgram
 from diffabs.engine.step.modes import Mode, find_contradicted
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.actuators import Delay, Lag
 from diffabs.parts.controllers import (
     PID,

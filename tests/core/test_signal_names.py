@@ -82,7 +82,7 @@ def shown_as(name: str) -> d.Loop:
     return loop_of(pytree(type("Named", (Decay,), {"shows": shows}))())
 
 
-@killed_by("core.loop", '"metrics", "units"}', '"metrics"}', case="units")
+@killed_by("loop.closed_loop", '"metrics", "units"}', '"metrics"}', case="units")
 @pytest.mark.parametrize("name", NAMES)
 def test_an_output_with_the_name_of_a_signal_is_refused(name):
     loop, why = shown_as(name), rf"^plant.shows: no output can be called {name}, like a signal of the loop"
@@ -149,7 +149,7 @@ def test_states_of_one_name_keep_flow_and_held():
     assert equations.states == ("plant.0", "controller.flow.x", "controller.held.x", "t")
 
 
-@killed_by("engine.arguments", 'RESERVED_METRICS = ("", ', "RESERVED_METRICS = (")
+@killed_by("loop.arguments", 'RESERVED_METRICS = ("", ', "RESERVED_METRICS = (")
 @pytest.mark.parametrize("name", ["", "stopped", "diverged", "timed_out"])
 def test_a_metric_with_the_name_of_another_result_is_refused(name):
     """A table of runs has the flags as columns; an empty name is that of the plant's audit."""

@@ -7,7 +7,7 @@ from matplotlib.text import Text
 from mutants import killed_by
 
 from diffabs import plants
-from diffabs.engine.run import rollout
+from diffabs.loop.run import rollout
 from diffabs.output import plot
 from diffabs.parts.objectives import Effort, TorqueRate, Variation
 from diffabs.scenario import scenario
@@ -29,7 +29,7 @@ def test_a_plant_says_the_unit_of_its_control(plant, unit):
 
 @pytest.mark.slow
 @killed_by(
-    "engine.convert",
+    "loop.convert",
     "control = plant.control_unit if plant is not None else",
     'control = "N m" if plant is not None else',
 )

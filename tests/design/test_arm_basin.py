@@ -11,10 +11,10 @@ from scipy.linalg import solve_continuous_are
 
 from diffabs import braking
 from diffabs.core.pytree import replace
-from diffabs.engine.run import measure
-from diffabs.engine.types import FixedStep
+from diffabs.engine.solvers import FixedStep
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import recoverable_bound
+from diffabs.loop.run import measure
 from diffabs.papers.arm_balance import TUNED, heaviest
 from diffabs.parts.controllers import BalanceFeedback, ObserverFeedback, Sampled
 from diffabs.parts.objectives import FinalNorm

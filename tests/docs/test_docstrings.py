@@ -141,7 +141,7 @@ DEAR = (  # some seconds of compiling
         "diffabs.linear.riccati.care",
         "diffabs.uncertainty.reliability.failure.failure_probability",
     ),
-    *("diffabs.loop.ensemble.run_batch", "diffabs.engine.run.measure", "diffabs.linear.linearization.linearize"),
+    *("diffabs.loop.ensemble.run_batch", "diffabs.loop.run.measure", "diffabs.linear.linearization.linearize"),
     *("diffabs.parts.roads.optimum.peak", "diffabs.tune.tuning.tune", "diffabs.tune.worst.worst_case"),
     *(
         "diffabs.uncertainty.sweep.run.sweep",
@@ -149,7 +149,7 @@ DEAR = (  # some seconds of compiling
         "diffabs.robust.reach.cover.cover_box",
         "diffabs.scenario.proofs.prove_box",
     ),
-    *("diffabs.engine.solve.solve", "diffabs.engine.run.rollout"),
+    *("diffabs.engine.solve.solve", "diffabs.loop.run.rollout"),
 )
 
 

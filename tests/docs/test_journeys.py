@@ -47,14 +47,14 @@ def test_there_are_these_journeys_of_at_most_40_lines():
     assert {page: count for page, count in lines.items() if count > 40} == {}
 
 
-@killed_by("engine.convert", '.set_index("t")', "", case="journeys/pandas.md")
+@killed_by("loop.convert", '.set_index("t")', "", case="journeys/pandas.md")
 @killed_by(
     "linear.transfer",
     "period=float(model.dt) if model.dt else None",
     "period=None",
     case="journeys/python-control.md",
 )
-@killed_by("engine.convert", "good.min(), good.max()", "good.max(), good.min()", case="journeys/lanes.md")
+@killed_by("loop.convert", "good.min(), good.max()", "good.max(), good.min()", case="journeys/lanes.md")
 @pytest.mark.parametrize("page", cases(EXECUTED, *SLOW, *ECOSYSTEM))
 def test_its_code_prints_what_the_page_says(page, tmp_path, monkeypatch):
     if page in needs and shutil.which(needs[page]) is None:

@@ -15,13 +15,13 @@ from scipy.optimize import brentq
 import diffabs as d
 from diffabs import actuators, controllers, plants, references, roads, stops
 from diffabs.core.cubic import Cubic, HermiteStep
-from diffabs.core.loop import LoopState
 from diffabs.core.protocols import Memory
 from diffabs.core.pytree import arrays, get, prepare_parts, refine_parts
-from diffabs.engine.arguments import prepare_arguments
 from diffabs.engine.step import step_size, surfaces
 from diffabs.engine.step.adaptive import StateSpan
 from diffabs.engine.step.replay import BASE_LOG_CAPACITY, log_capacity, states_between
+from diffabs.loop.arguments import prepare_arguments
+from diffabs.loop.closed_loop import LoopState
 from diffabs.parts.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.robust.design.attraction import Cells, region_of_attraction
 from diffabs.scenario.scenario import load

@@ -76,8 +76,8 @@ class Slow(NamedTuple):
     def data_of(self, number):
         return number
 
-    def has_reached(self, number, output):
-        return output.speed < self.speeds[jnp.minimum(number, len(self.speeds) - 1)]
+    def has_reached(self, number, sample):
+        return sample.output.speed < self.speeds[jnp.minimum(number, len(self.speeds) - 1)]
 
 
 @pytest.fixture(params=cases(["refilled", "together"], "together"))
@@ -222,8 +222,8 @@ class Far(NamedTuple):
     def data_of(self, number):
         return number
 
-    def has_reached(self, number, output):
-        return output.x > self.places[jnp.minimum(number, len(self.places) - 1)]
+    def has_reached(self, number, sample):
+        return sample.output.x > self.places[jnp.minimum(number, len(self.places) - 1)]
 
 
 @killed_by(

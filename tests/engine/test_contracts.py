@@ -14,7 +14,7 @@ import diffabs as d
 from diffabs import objectives, references
 from diffabs.core.protocols import Memory, no_flow, no_memory
 from diffabs.core.pytree import param, pytree
-from diffabs.engine.contracts import find_misfits
+from diffabs.loop.contracts import find_misfits
 
 
 class Temperature(NamedTuple):
@@ -180,8 +180,8 @@ KINDS = {"plant": Oven, "controller": Proportional, "stop": Cold}
     ("family", "line"),
     [pytest.param(family, line, id=f"{family}-{i}") for family in MISTAKES for i, line in enumerate(MISTAKES[family])],
 )
-@killed_by("engine.contracts", "    if not lines:", "    if True:")
-@killed_by("engine.arguments", "    refuse_misfits(loop, objectives)\n", "")
+@killed_by("loop.contracts", "    if not lines:", "    if True:")
+@killed_by("loop.arguments", "    refuse_misfits(loop, objectives)\n", "")
 def test_a_mistake_in_a_part_is_one_line(family, line):
     part = with_methods(KINDS[family], **MISTAKES[family][line])
     for _ in range(2):  # a structure with a mistake is not remembered as one that fits
@@ -236,7 +236,7 @@ class Weighted(Proportional):
         return jnp.dot(self.weights, jnp.stack([signal.target, -signal.measured.above]))
 
 
-@killed_by("engine.contracts", "structure = structure, *map(np.shape, leaves)", "structure = structure, ()")
+@killed_by("loop.contracts", "structure = structure, *map(np.shape, leaves)", "structure = structure, ()")
 def test_a_shape_that_does_not_fit_is_found_after_one_that_fits():
     parts = {"plant": Oven(), "initial": (), "reference": references.Setpoint(value=180.0), "stop": Cold()}
     fits, broken = (d.Loop(controller=Weighted(weights=np.ones(count)), **parts) for count in (2, 3))

@@ -19,9 +19,9 @@ from mutants import killed_by
 import diffabs as d
 from diffabs import objectives
 from diffabs.core.summary import Summary, format_cell, round_for_table
-from diffabs.engine.convert import signal_columns, write_csv
-from diffabs.engine.matlab import write_mat
 from diffabs.host import interactive
+from diffabs.loop.convert import signal_columns, write_csv
+from diffabs.loop.matlab import write_mat
 from diffabs.output.plot.style import sheet
 from diffabs.parts.controllers import HoldingInput, StateFeedback
 from diffabs.parts.plants import BrakeStart, MirroredRig
@@ -88,7 +88,7 @@ def test_a_summary_is_text_and_html():
     assert "<td>0</td>" in html
 
 
-@killed_by("engine.convert", '"reached its stop {end}" if run.stopped', '"reached its stop {end}" if True')
+@killed_by("loop.convert", '"reached its stop {end}" if run.stopped', '"reached its stop {end}" if True')
 def test_a_run_says_what_it_is(run):
     lines = repr(run).splitlines()
     end = float(run.ending.sample.t)
@@ -124,8 +124,8 @@ def test_many_runs_are_counted_and_a_traced_one_can_be_shown():
     assert frame["stopped"].tolist() == [True] * 3
 
 
-@killed_by("engine.convert", 'pandas = import_optional("pandas")', "import pandas", case="pandas")
-@killed_by("engine.convert", 'xarray = import_optional("xarray")', "import xarray", case="xarray")
+@killed_by("loop.convert", 'pandas = import_optional("pandas")', "import pandas", case="pandas")
+@killed_by("loop.convert", 'xarray = import_optional("xarray")', "import xarray", case="xarray")
 @pytest.mark.parametrize("package", ["pandas", "xarray"])
 def test_a_package_that_is_missing_is_named(run, package, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
@@ -133,10 +133,8 @@ def test_a_package_that_is_missing_is_named(run, package, monkeypatch):
         getattr(run, package)(rig().plant)
 
 
-@killed_by("engine.convert", "np.asarray(values)[:rows])", "np.asarray(values))")
-@killed_by(
-    "engine.convert", "plant.control_unit if plant is not None else DEFAULT_CONTROL_UNIT", "DEFAULT_CONTROL_UNIT"
-)
+@killed_by("loop.convert", "np.asarray(values)[:rows])", "np.asarray(values))")
+@killed_by("loop.convert", "plant.control_unit if plant is not None else DEFAULT_CONTROL_UNIT", "DEFAULT_CONTROL_UNIT")
 def test_frames_have_units_and_end_where_the_run_does(run):
     count = int(np.sum(run.trajectory.running)) + 1
     frame, plant = run.pandas(rig().plant), rig().plant
@@ -162,8 +160,8 @@ def test_frames_have_units_and_end_where_the_run_does(run):
         jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), run).pandas()
 
 
-@killed_by("engine.convert", 'if name in ("target", "setpoint") else control', 'if name == "target" else control')
-@killed_by("core.loop", 'if name not in ("t", "output"))', 'if name not in ("t", "output", "setpoint"))')
+@killed_by("loop.convert", 'if name in ("target", "setpoint") else control', 'if name == "target" else control')
+@killed_by("loop.closed_loop", 'if name not in ("t", "output"))', 'if name not in ("t", "output", "setpoint"))')
 def test_every_table_and_file_has_the_same_columns(run, tmp_path):
     """Units and values of CSV, MAT, zarr and xarray are those of pandas."""
     plant = rig().plant
@@ -215,7 +213,7 @@ def cells(html):
     return [re.findall(r"<td>(.*?)</td>", row) for row in re.findall(r"<tr>(<td>.*?)</tr>", html)]
 
 
-@killed_by("core.loop", "spec.interval()) for", '"") for')
+@killed_by("loop.closed_loop", "spec.interval()) for", '"") for')
 def test_a_loop_and_a_batch_have_tables_in_a_notebook():
     html = rig()._repr_html_()
     assert "plant MirroredRig" in html

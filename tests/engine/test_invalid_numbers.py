@@ -8,10 +8,10 @@ from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, objectives
-from diffabs.engine.arguments import prepare_arguments
-from diffabs.engine.result import finish_run, prepare
 from diffabs.engine.solve import SolutionStatus
 from diffabs.engine.step.status import RunStatus
+from diffabs.loop.arguments import prepare_arguments
+from diffabs.loop.result import finish_run
 
 
 @pytest.mark.slow
@@ -61,11 +61,11 @@ def weighted(weight):
     return {"cost": objectives.QuadraticCost(q=jnp.stack([weight, 0.0]), r=1e-3)}
 
 
-@killed_by("engine.result", "diverged, (loop, objectives))", "diverged, loop)")
+@killed_by("loop.result", "diverged, (loop, objectives))", "diverged, loop)")
 def test_a_diverged_run_has_no_derivative_by_a_number_of_its_objective():
     def cost(weight):
         loop, measured, method = prepare_arguments(LOOP, d.Adaptive(1e-6, 1.0, 1e-2), weighted(weight))
-        loop, audit = prepare(loop)
+        loop, audit = loop.prepare_run()
         carry = jax.lax.stop_gradient(method.start(loop, measured | audit, None))
         status = jnp.full_like(carry.status, RunStatus.DIVERGED)
         return finish_run(loop, measured | audit, carry._replace(status=status))[0].metrics["cost"]

@@ -7,7 +7,7 @@ from commands import run as command
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.engine.matlab import write_mat
+from diffabs.loop.matlab import write_mat
 
 io = pytest.importorskip("scipy.io")
 
@@ -35,7 +35,7 @@ def test_a_mat_file_has_what_the_csv_has(folder):
     assert found["scenario"] == "slip-lmi"
 
 
-@killed_by("engine.matlab", ', oned_as="column"', "")
+@killed_by("loop.matlab", ', oned_as="column"', "")
 def test_a_mat_file_has_metrics_and_parameters(folder):
     found = io.loadmat(folder / "run.mat", simplify_cells=True)
     assert found["parameters"]["plant_mass"] == 5.3
@@ -47,9 +47,9 @@ def test_a_mat_file_has_metrics_and_parameters(folder):
     assert (folder / "run.mat").read_bytes()[:19] == b"MATLAB 5.0 MAT-file"
 
 
-@killed_by("engine.matlab", "while new in renamed:", "while False:")
-@killed_by("engine.matlab", "if valid in KEYWORDS", "if False")
-@killed_by("engine.matlab", "[:MAX_NAME]", "[:99]")
+@killed_by("loop.matlab", "while new in renamed:", "while False:")
+@killed_by("loop.matlab", "if valid in KEYWORDS", "if False")
+@killed_by("loop.matlab", "[:MAX_NAME]", "[:99]")
 def test_every_name_becomes_one_of_matlab(tmp_path):
     loop, values = d.braking(), {"a.b": 1.0, "a-b": 2.0, "90pct": 3.0, "_c": 4.0, 70 * "d": 5.0}
     values |= {"end": 6.0, "a_": 7.0, "double": 8.0, "a": 9.0, "a_table": 10.0}

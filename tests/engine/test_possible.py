@@ -11,7 +11,7 @@ import diffabs as d
 from diffabs import actuators, controllers, objectives
 from diffabs.core import blocks
 from diffabs.core.pytree import parameters, replace
-from diffabs.engine.contracts import find_misfits
+from diffabs.loop.contracts import find_misfits
 from diffabs.parts.objectives import BALANCE, BRAKING
 from diffabs.scenario.defaults import braking
 

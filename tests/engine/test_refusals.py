@@ -19,9 +19,9 @@ from diffabs import actuators, controllers, objectives, plants, references, road
 from diffabs.core.protocols import BrakeOutput, Ending, Sample, resting_segment
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.validity import find_problems
-from diffabs.engine import admissible
-from diffabs.engine import stability as stable_step
-from diffabs.engine.result import _is_impossible
+from diffabs.loop import admissible
+from diffabs.loop import stability as stable_step
+from diffabs.loop.result import _is_impossible
 from diffabs.parts.objectives import BALANCE, BRAKING
 from diffabs.parts.plants.audit import BrakeAudit
 from diffabs.parts.stops import Fallen, SpeedReached
@@ -106,7 +106,7 @@ def any_step(monkeypatch):
 
 class TestBeforeARun:
     @killed_by(
-        "engine.admissible",
+        "loop.admissible",
         "    yield _start_rule(loop)\n    yield from grid_rules(loop, step)",
         "    yield _start_rule(loop)",
         case="ring",
@@ -145,7 +145,7 @@ class TestBeforeARun:
             found = admissible.batch_admissibility(loop, {"plant.mass": np.array([5.3, -1.0])}, SOLVER)
             assert found.accepted.tolist() == [True, False], found.texts
 
-    @killed_by("engine.admissible", "if not (kinks is None or isinstance(kinks, bool)):", "if False:")
+    @killed_by("loop.admissible", "if not (kinks is None or isinstance(kinks, bool)):", "if False:")
     def test_a_solver_that_fits_nothing_is_named(self, any_step):
         for solver, message in (
             (d.FixedStep(0.3, 0.25), "longer than solver.duration"),
@@ -158,14 +158,14 @@ class TestBeforeARun:
             with pytest.raises(ValueError, match=message):
                 d.check(RIG, solver)
 
-    @killed_by("engine.admissible", "    step = float(solver.step)", "    step = solver.step")
+    @killed_by("loop.admissible", "    step = float(solver.step)", "    step = solver.step")
     @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
     def test_the_step_may_be_an_array_without_axes(self, any_step, array):
         solver = dataclasses.replace(SOLVER, step=array(SOLVER.step))
         found = admissible.batch_admissibility(RIG, {"plant.mass": np.array([5.0, -1.0])}, solver)
         assert found.accepted.tolist() == [True, False]
 
-    @killed_by("engine.admissible", "if lines := list(find_misshapen(part)):", "if lines := []:")
+    @killed_by("loop.admissible", "if lines := list(find_misshapen(part)):", "if lines := []:")
     @pytest.mark.parametrize(
         ("run", "message"),
         [
@@ -180,7 +180,7 @@ class TestBeforeARun:
             run(replace(RIG, {"plant.mass": [1.0, 2.0]}))
 
     @pytest.mark.slow
-    @killed_by("engine.stability", "bound = jnp.max(jnp.exp(log)", "bound = 0.5 * jnp.max(jnp.exp(log)")
+    @killed_by("loop.stability", "bound = jnp.max(jnp.exp(log)", "bound = 0.5 * jnp.max(jnp.exp(log)")
     def test_the_step_is_judged_as_by_the_eigenvalues(self):
         """Whatever a lane is decided by: the first bound, the squared one, or its eigenvalues; the last are NumPy's."""
         rng = np.random.default_rng(0)
@@ -210,7 +210,7 @@ class TestBeforeARun:
 
     @pytest.mark.slow
     @killed_by(
-        "engine.stability",
+        "loop.stability",
         "bound = jnp.max(jnp.minimum(rows, columns))",
         "bound = 0.5 * jnp.max(jnp.minimum(rows, columns))",
     )
@@ -242,7 +242,7 @@ class TestBeforeARun:
 
 class TestAfterARun:
     @pytest.mark.slow
-    @killed_by("engine.result", 'audit = getattr(loop.plant, "audit", None)', "audit = None")
+    @killed_by("loop.result", 'audit = getattr(loop.plant, "audit", None)', "audit = None")
     @pytest.mark.parametrize("step", [1e-4, 1e-3])
     def test_an_unstable_step_with_finite_numbers_is_refused(self, step):
         """At 1e-6 s the run ends after three steps at -1e13 m: it has not stopped, and there is no mean to enter."""
@@ -270,7 +270,7 @@ class TestAfterARun:
         balanced = jax.jit(lambda start: d.measure(replace(d.balancing(), {"initial.theta": start}), SOLVER, BALANCE))
         assert balanced(2.0).diverged
 
-    @killed_by("engine.result", "(value >= low - PHYSICAL_RANGE_TOLERANCE)", "(value >= -jnp.inf)")
+    @killed_by("loop.result", "(value >= low - PHYSICAL_RANGE_TOLERANCE)", "(value >= -jnp.inf)")
     def test_a_metric_outside_its_range_is_a_run_that_diverged(self):
         for part in (*BRAKING.values(), *BALANCE.values()):
             assert type(part).physical[0] <= 0

@@ -12,10 +12,10 @@ from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, plants, references, roads
-from diffabs.engine.arguments import prepare_arguments
-from diffabs.engine.result import finish_run, prepare
-from diffabs.engine.run import _run
-from diffabs.engine.stability import stable_step
+from diffabs.engine.drive.runs import _run
+from diffabs.loop.arguments import prepare_arguments
+from diffabs.loop.result import finish_run
+from diffabs.loop.stability import stable_step
 from diffabs.parts.actuators import Lag
 from diffabs.parts.objectives import BRAKING, Effort, MaxSlip, TorqueRate, Variation
 from diffabs.parts.stops import SpeedReached, Standstill
@@ -93,7 +93,7 @@ def test_the_peak_of_a_falling_slip_is_its_first_value():
 
 
 @killed_by(
-    "engine.result",
+    "loop.result",
     "(carry.status == RunStatus.TIMED_OUT) & ~diverged",
     "(carry.status == RunStatus.LANDING) & ~diverged",
 )
@@ -169,7 +169,7 @@ def test_new_values_do_not_compile_again():
 
 @jax.jit
 def plainly(loop, objectives, method, tries):
-    loop, audit = prepare(loop)
+    loop, audit = loop.prepare_run()
     objectives = objectives | audit
     carry = method.start(loop, objectives, None)
     over = jax.lax.fori_loop(
@@ -233,7 +233,7 @@ def test_a_batch_ends_with_its_last_lane():
 
 
 @killed_by(
-    "engine.result",
+    "loop.result",
     "invalidate(metrics, diverged, (loop, objectives))",
     "metrics",
 )

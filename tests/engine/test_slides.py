@@ -12,8 +12,8 @@ from marks import cases
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.core.loop import Loop
-from diffabs.engine.sliding import describe_slide
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.sliding import describe_slide
 from diffabs.parts.actuators import Lag
 from diffabs.parts.controllers import PID, HoldingInput, ScheduledFeedback
 from diffabs.parts.objectives import IAE

@@ -11,9 +11,8 @@ from mutants import killed_by
 from seams import replace_seam
 
 import diffabs as d
-from diffabs.engine import admissible, arguments
-from diffabs.engine.faults import Fault
-from diffabs.loop import ensemble
+from diffabs.loop import admissible, arguments, ensemble
+from diffabs.loop.faults import Fault
 from diffabs.parts.objectives import IAE, StopDistance
 
 MEASURED = {"distance": StopDistance()}
@@ -35,7 +34,7 @@ def fresh(caplog, monkeypatch):
     return caplog
 
 
-@killed_by("engine.arguments", "lines or list(find_unstable_step(loop, solver))", "lines")
+@killed_by("loop.arguments", "lines or list(find_unstable_step(loop, solver))", "lines")
 def test_an_unstable_step_is_refused(fresh):
     for simulate in (lambda: d.measure(d.braking(), LONG, MEASURED), lambda: d.rollout(d.braking(), LONG)):
         with pytest.raises(ValueError, match=r"^solver.step = 0.5 s is not stable: [^\n]* \(0, 0.0001\d*\] s$"):
@@ -43,8 +42,8 @@ def test_an_unstable_step_is_refused(fresh):
     assert said(fresh) == []
 
 
-@killed_by("engine.arguments", "if not was_step_checked(loop, solver):", "if False:")
-@killed_by("engine.admissible", "        _stable_steps.add(", "        set().add(")
+@killed_by("loop.arguments", "if not was_step_checked(loop, solver):", "if False:")
+@killed_by("loop.admissible", "        _stable_steps.add(", "        set().add(")
 def test_a_traced_step_is_named_once_unless_it_was_checked(fresh):
     def distance(mass, step):
         loop = d.replace(d.braking(), {"plant.mass": mass})
@@ -75,7 +74,7 @@ def test_a_batch_says_why_runs_are_refused(fresh):
     )
 
 
-@killed_by("engine.result", "RunStatus.REFUSED: Fault.REFUSED,", "")
+@killed_by("loop.result", "RunStatus.REFUSED: Fault.REFUSED,", "")
 @pytest.mark.parametrize("engine", cases(["xla", "kernel"], "xla"))
 def test_a_run_says_why_it_diverged(engine):
     """Reference: what is done to each run, and for the second one that 0.5 s is far beyond the stable 0.19 ms."""

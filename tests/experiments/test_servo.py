@@ -23,9 +23,9 @@ from diffabs import FixedStep, Loop, measure, replace, rollout
 from diffabs.core.pytree import parameters
 from diffabs.core.units import Units, resolve_unit
 from diffabs.core.validity import check_part
-from diffabs.engine.stability import stable_step
 from diffabs.linear.operating_point import operating_point
 from diffabs.linear.regulator import lqr
+from diffabs.loop.stability import stable_step
 from diffabs.parts.controllers import PID, Clamping, Sampled
 from diffabs.parts.objectives import IAE, ITAE, FinalError, Overshoot, SettlingTime
 from diffabs.parts.plants import QuarterCar
@@ -212,7 +212,7 @@ def test_units_are_those_of_the_loop(servo):
     assert resolve_unit("control^2 s/signal", Units("N m/A", "m/s^2")) == "N^2 m s^3/A^2"
 
 
-@killed_by("engine.stability", "for base in (loop, arrived)", "for base in (loop,)")
+@killed_by("loop.stability", "for base in (loop, arrived)", "for base in (loop,)")
 def test_the_step_is_judged_with_an_unsaturated_controller(servo):
     """At the start the PID commands 24 V whatever happens; its own fast mode is only seen on the target."""
     loop, _ = linear(servo, value=1.0)

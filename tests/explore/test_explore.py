@@ -22,11 +22,11 @@ from seams import replace_seam
 
 from diffabs.cli import console
 from diffabs.core.pytree import get, parameters, replace
-from diffabs.engine.run import rollout
 from diffabs.host.values import ScenarioError
 from diffabs.linear import margins, open_loop
 from diffabs.linear.stability_margins import closed_loop_poles
 from diffabs.linear.transfer import Transfer
+from diffabs.loop.run import rollout
 from diffabs.output.explore import charts, curves, friction, saving, stability, tuning
 from diffabs.output.explore.knobs import SLIDER_STEPS, is_vehicle
 from diffabs.output.explore.panels import Curve, Curves, Fan, Panel, Spread

@@ -15,7 +15,7 @@ from diffabs import controllers, objectives, plants, references, roads, stops
 from diffabs.core.pytree import param, pytree, replace
 from diffabs.core.reason import Reason
 from diffabs.core.types import Scalar
-from diffabs.engine.stability import stable_step
+from diffabs.loop.stability import stable_step
 from diffabs.scenario.defaults import braking
 from diffabs.tune.identify.data import Comparison
 from diffabs.tune.identify.fit import Tolerances, fit

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mutants import killed_by
 
-from diffabs.engine.types import FixedStep
+from diffabs.engine.solvers import FixedStep
 from diffabs.parts.controllers import StateFeedback
 from diffabs.tune.identify.fit import fit
 from diffabs.tune.identify.noise import describe_residuals, match_times

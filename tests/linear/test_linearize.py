@@ -15,7 +15,6 @@ from scipy.signal import cont2discrete
 
 import diffabs as d
 from diffabs.core.blocks import Direct, Series
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import BrakeOutput, Clock, no_flow, no_memory
 from diffabs.core.pytree import canonical_dtypes, param, pytree, replace
 from diffabs.core.validity import check_part
@@ -25,6 +24,7 @@ from diffabs.linear.linearization import linearize, tracking_dynamics
 from diffabs.linear.opened_loop import open_loop
 from diffabs.linear.operating_point import loop_gain, operating_point
 from diffabs.linear.slip_model import LowPass, Sampling, SlipModel
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.actuators import AsymmetricLag, Delay, Lag, Limits, RateLimit
 from diffabs.parts.controllers import (
     PID,

@@ -12,13 +12,13 @@ from oracles import arm_rates
 from scipy.integrate import solve_ivp
 
 from diffabs.core.pytree import canonical_dtypes, replace
-from diffabs.engine.run import measure
+from diffabs.engine.solvers import FixedStep
 from diffabs.engine.step.runge_kutta import rk4_step
-from diffabs.engine.types import FixedStep
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import transmission_zeros
 from diffabs.linear.regulator import lqr
 from diffabs.linear.slip_model import Sampling
+from diffabs.loop.run import measure
 from diffabs.parts.objectives import PeakArmAngle, PeakVoltage
 from diffabs.parts.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
 from diffabs.parts.plants.arm_balance import ArmState

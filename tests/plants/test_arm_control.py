@@ -14,10 +14,10 @@ from scipy.integrate import solve_ivp
 from diffabs.core.protocols import BalanceOutput, Clock, Memory, Tracking
 from diffabs.core.pytree import replace
 from diffabs.core.validity import check_part, find_problems
-from diffabs.engine.run import measure
-from diffabs.engine.types import FixedStep
+from diffabs.engine.solvers import FixedStep
 from diffabs.linear.gaussian import SELECTION, kalman, lqg
 from diffabs.linear.recoverable import mode_bounds, recoverable_bound
+from diffabs.loop.run import measure
 from diffabs.parts.controllers import BalanceFeedback, ObserverFeedback, Sampled
 from diffabs.parts.controllers.balance import ObserverMemory
 from diffabs.parts.objectives import FinalNorm

@@ -7,7 +7,7 @@ import pytest
 from mutants import killed_by
 
 from diffabs.core.protocols import BalanceOutput, BrakeOutput, Sample
-from diffabs.engine.types import Run, Trajectory
+from diffabs.loop.result import Run, Trajectory
 from diffabs.output import plot
 from diffabs.output.plot import tuning
 

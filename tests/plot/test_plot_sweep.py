@@ -11,7 +11,7 @@ from scipy.stats import beta
 from seams import replace_seam
 from sweeping import manifest
 
-from diffabs.engine.types import FixedStep
+from diffabs.engine.solvers import FixedStep
 from diffabs.output.plot import sweeps as plots
 from diffabs.scenario.defaults import balancing
 from diffabs.uncertainty.sweep import Results, Space, Study, Uniform

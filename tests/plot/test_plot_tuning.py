@@ -5,7 +5,7 @@ import pytest
 from mutants import killed_by
 
 from diffabs.core.protocols import BrakeOutput, Sample
-from diffabs.engine.types import Trajectory
+from diffabs.loop.result import Trajectory
 from diffabs.output.plot import tuning as plots
 from diffabs.tune import DescentPoint
 

@@ -10,7 +10,7 @@ from mutants import killed_by
 from seams import replace_seam
 
 from diffabs import controllers, roads
-from diffabs.engine.types import Adaptive, FixedStep
+from diffabs.engine.solvers import Adaptive, FixedStep
 from diffabs.parts.objectives import BRAKING
 from diffabs.scenario import outside, registry, scenario
 from diffabs.scenario.defaults import braking

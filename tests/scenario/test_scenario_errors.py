@@ -324,7 +324,7 @@ def test_nothing_is_evaluated(file):
 
 @pytest.fixture
 def checked_step(monkeypatch):
-    from diffabs.engine.stability import stable_step
+    from diffabs.loop.stability import stable_step
 
     replace_seam(monkeypatch, "stable_step", stable_step)
 

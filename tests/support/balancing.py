@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from diffabs.core.pytree import replace
-from diffabs.engine.types import FixedStep
+from diffabs.engine.solvers import FixedStep
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.parts.controllers import BalanceFeedback
 from diffabs.parts.plants import ArmBalance

@@ -25,9 +25,10 @@ import numpy as np
 
 from diffabs.core.protocols import BrakeOutput
 from diffabs.core.pytree import elements, get
-from diffabs.engine.run import measure
-from diffabs.engine.stability import stable_step
-from diffabs.engine.types import FixedStep, Run
+from diffabs.engine.solvers import FixedStep
+from diffabs.loop.result import Run
+from diffabs.loop.run import measure
+from diffabs.loop.stability import stable_step
 from diffabs.scenario import registry, toml
 from diffabs.scenario.scenario import Scenario, ScenarioError, dump, loads
 

@@ -46,8 +46,8 @@ import numpy as np
 import random_loops
 
 from diffabs.core.pytree import canonical_dtypes, get, refine_parts, replace
-from diffabs.engine.run import measure
-from diffabs.engine.types import Adaptive, FixedStep
+from diffabs.engine.solvers import Adaptive, FixedStep
+from diffabs.loop.run import measure
 
 WIDTHS = (1e-2, 3e-3, 1e-3)
 CLOSER, FINER = (1e-4, 3e-5, 1e-5), 4  # widths, and steps so many times shorter, for what seems wrong

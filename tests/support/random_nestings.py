@@ -20,7 +20,7 @@ from gradients_random import SURE, WIDTHS, Found, _at, _moved, judge
 
 import diffabs as d
 from diffabs.core.pytree import canonical_dtypes
-from diffabs.engine.run import run_unchecked
+from diffabs.loop.run import run_unchecked
 
 SAME = 1e-5  # of the scale: Jacobians of two engines
 INPUTS, OBJECTIVES = 7, 4  # numbers that are differentiated, and objectives: each costs time to compile

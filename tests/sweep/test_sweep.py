@@ -25,7 +25,7 @@ from sweeping import described, manifest
 
 import diffabs as d
 from diffabs import roads
-from diffabs.engine.run import measure, rollout
+from diffabs.loop.run import measure, rollout
 from diffabs.parts.objectives import Effort
 from diffabs.scenario.defaults import balancing
 from diffabs.uncertainty.sweep import (
@@ -298,7 +298,7 @@ def test_a_half_step_that_turns_never_into_a_number(study, swept):
     assert found["metrics"]["overshoot"]["sample"] == repeated[2]
 
 
-@killed_by("engine.types", "fields if solver.kinks is None else", "fields if True else")
+@killed_by("engine.solvers", "fields if solver.kinks is None else", "fields if True else")
 def test_steps_on_kinks_are_another_sweep(study, tmp_path):
     """Without a choice the table stays that of older versions, whose sweeps can be continued."""
     entries = {}

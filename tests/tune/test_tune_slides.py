@@ -5,7 +5,7 @@ import sliding
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.core.loop import Loop
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.controllers import PID
 from diffabs.parts.objectives import IAE
 from diffabs.parts.references import Setpoint

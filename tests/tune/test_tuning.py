@@ -16,8 +16,8 @@ import diffabs as d
 from diffabs import actuators, controllers, plants, references
 from diffabs.core.pytree import canonical_dtypes, param, pytree
 from diffabs.core.validity import find_problems
-from diffabs.engine.stability import stable_step, stable_steps
 from diffabs.linear.slip_model import Sampling, SlipModel
+from diffabs.loop.stability import stable_step, stable_steps
 from diffabs.parts.objectives import BRAKING
 from diffabs.parts.objectives.balance import PeakTorque
 from diffabs.parts.objectives.tracking import FinalValue
@@ -305,12 +305,12 @@ class TestStability:
         np.testing.assert_allclose(stable_steps(batch), each, rtol=1e-12)
 
     @killed_by(
-        "engine.stability",
+        "loop.stability",
         "angles = np.abs(np.angle(direction))",
         "angles = np.full(np.shape(direction), np.pi)",
     )
     def test_the_limit_of_a_real_and_of_an_imaginary_mode(self):
-        from diffabs.engine.stability import _radius
+        from diffabs.loop.stability import _radius
 
         np.testing.assert_allclose(_radius(np.array([-1.0 + 0j])), 2.785, atol=1.5e-3)  # the roots of |R(z)| = 1
         np.testing.assert_allclose(_radius(np.array([1j])), np.sqrt(8.0), atol=1.5e-3)

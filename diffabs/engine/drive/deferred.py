@@ -40,7 +40,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import PyTree
 from diffabs.engine.drive.engine import EngineError, check_process, describe_engine, is_forked
-from diffabs.engine.result import Finish, prepare
+from diffabs.engine.hybrid import Finish
 from diffabs.host.process import default_platform
 
 MIN_RUNS = 2  # runs whose values a kernel makes: the values of one run wait longer for its compiler than for XLA
@@ -58,11 +58,11 @@ class DeferredRun(NamedTuple):
     """What is known of a run while it is traced; equal for two runs that differ in numbers only.
 
     Attributes:
-        structure: Structure of (loop, objectives, method, key).
+        structure: Structure of (system, objectives, method, key).
         key_kinds: For each leaf the implementation of its random key, or None for an array.
         results: Shapes and types of the leaves of the result of one run.
         capacity: What `by_xla` needs besides the run: a hashable object with an attribute `finish`, the function that
-            returns the result from loop, objectives and the last carry.
+            returns the result from system, objectives and the last carry.
         by_xla: Function of the capacity and the run that returns the result by XLA, with both modes of derivatives.
         required: True if the engine is "kernel": XLA makes none of its values and first derivatives.
     """
@@ -82,8 +82,8 @@ class DeferredRun(NamedTuple):
         """Return the leaves of the run by a kernel; `Unsupported` or `NoCompiler` if that is impossible."""
         from diffabs.engine.drive.kernel import run_single  # `import diffabs` must not need the compiler
 
-        loop, objectives, method, key = _rebuild(self.structure, self.key_kinds, leaves)
-        return jax.tree.leaves(run_single(loop, objectives, method, self.capacity.finish, key))
+        hybrid, objectives, method, key = _rebuild(self.structure, self.key_kinds, leaves)
+        return jax.tree.leaves(run_single(hybrid, objectives, method, self.capacity.finish, key))
 
 
 def run_deferred(by_xla: Callable[[Any, PyTree], PyTree], capacity: Any, run: PyTree, required: bool = False) -> PyTree:
@@ -108,16 +108,16 @@ def _result_shape(structure: object, kinds: tuple[Any, ...], finish: Finish, lea
     """Return the result of one run as shapes: that of a run which is over before its first step."""
 
     def finish_at_start(*leaves: PyTree) -> PyTree:
-        loop, objectives, method, key = _rebuild(structure, kinds, leaves)
-        loop, audit = prepare(loop)
-        objectives = objectives | audit
-        return finish(loop, objectives, method.start(loop, objectives, key))[0]
+        hybrid, objectives, method, key = _rebuild(structure, kinds, leaves)
+        hybrid, further = hybrid.prepare_run()
+        objectives = {**objectives, **further}
+        return finish(hybrid, objectives, method.start(hybrid, objectives, key))[0]
 
     return jax.tree.map(_type, jax.eval_shape(finish_at_start, *leaves))
 
 
 def _rebuild(structure: object, kinds: tuple[Any, ...], leaves: Leaves) -> tuple[PyTree, PyTree, PyTree, PyTree]:
-    """Return (loop, objectives, method, key) of the leaves, whose random keys are words."""
+    """Return (system, objectives, method, key) of the leaves, whose random keys are words."""
     pairs = zip(leaves, kinds, strict=True)
     return jax.tree.unflatten(
         structure, [x if kind is None else jax.random.wrap_key_data(x, impl=kind) for x, kind in pairs]

@@ -7,7 +7,6 @@ room for the next one, as in `packed`. The kernel deals the runs to threads of i
 
 import functools
 import operator
-from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -19,50 +18,44 @@ from diffabs.compiler.pipeline import run_lanes
 from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.compiling import is_traced
 from diffabs.core.log import log_rows
-from diffabs.core.loop import BLOCKS, Loop, LoopState
-from diffabs.core.protocols import Objective
-from diffabs.core.pytree import canonical_dtypes, prepare_derivatives
+from diffabs.core.pytree import prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero, read_leaves
 from diffabs.core.types import Bool, Key, Params, PyTree, Scalar, Vector
-from diffabs.engine.arguments import forbid_derivatives, prepare_arguments, refuse_derivative
 from diffabs.engine.drive.engine import check_process
 from diffabs.engine.drive.loops import STEPS_PER_BLOCK
-from diffabs.engine.drive.packed import STEPS_PER_EXCHANGE, EarlyEnd, split_by_lane
-from diffabs.engine.result import Finish, finish_run
+from diffabs.engine.drive.packed import STEPS_PER_EXCHANGE, EarlyEnd, sample_now, split_by_lane
+from diffabs.engine.hybrid import Finish, HybridSystem, Objectives
 from diffabs.engine.step.adaptive import AdaptiveStepping
-from diffabs.engine.step.replay import LaggedReplay, LaggedReplayStepping
+from diffabs.engine.step.replay import LaggedReplay, LaggedReplayStepping, refuse_derivative
 from diffabs.engine.step.status import RunStatus
-from diffabs.engine.types import Run, Solver
 
 MAX_LANES_PER_LAUNCH = 1 << 17  # runs that are started together: the carries of more runs would fill the memory
 
 
 def run_native(
-    loop: Loop,
+    hybrid: HybridSystem,
     values: Params,
     keys: PyTree,
-    solver: Solver,
-    objectives: Mapping[str, Objective],
+    method: PyTree,
+    objectives: Objectives,
     accepted: Vector,
+    finish: Finish,
     enough: EarlyEnd | None = None,
-) -> Run:
+) -> PyTree:
     """Return the result of `packed.run_packed`, equal to rounding and with forward derivatives.
 
     A step with an operation without a translation raises Unsupported, a machine without a compiler NoCompiler.
     """
-    loop, objectives, method = prepare_arguments(loop, solver, objectives)
-    values = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
-    values = {**values, **forbid_derivatives(loop, values)}
     count = len(accepted)
     enough = jax.tree.map(jnp.asarray, enough)
     early_data = None if enough is None else jax.vmap(enough.data_of)(jnp.arange(count))
     lanes = values, keys, accepted, early_data
 
-    def run_launch(rows: PyTree) -> Run:
+    def run_launch(rows: PyTree) -> PyTree:
         """Return the runs of one launch; `rows` are theirs of `lanes`."""
-        inputs = loop, rows[0], dict(objectives), method, *rows[1:], enough
+        inputs = hybrid, rows[0], dict(objectives), method, *rows[1:], enough
         # A call through a derivative rule costs more than a short run.
-        return _run_differentiable(finish_run, inputs) if is_traced(inputs) else _run(*inputs, finish=finish_run)
+        return _run_differentiable(finish, inputs) if is_traced(inputs) else _run(*inputs, finish=finish)
 
     if count <= MAX_LANES_PER_LAUNCH:
         return run_launch(lanes)
@@ -73,20 +66,22 @@ def run_native(
     return jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
 
 
-def run_single(loop: object, objectives: object, method: object, finish: Finish, key: Key | None = None) -> PyTree:
+def run_single(
+    hybrid: HybridSystem, objectives: object, method: object, finish: Finish, key: Key | None = None
+) -> PyTree:
     """Return one run, as `finish` makes it of the last carry; `jax.vmap` makes a lane of each run of a batch.
 
     The errors are those of `run_native`, and a RuntimeError in a process that was forked after JAX had started.
     """
     check_process()
     keys = None if key is None else key[None]
-    lane = _run_differentiable(finish, (loop, {}, objectives, method, keys, jnp.ones(1, bool), None, None))
+    lane = _run_differentiable(finish, (hybrid, {}, objectives, method, keys, jnp.ones(1, bool), None, None))
     return jax.tree.map(operator.itemgetter(0), lane)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _run_differentiable(finish: Finish, arguments: PyTree) -> PyTree:
-    """Return the runs of (loop, values, objectives, method, keys, accepted, data for early ends, early ends)."""
+    """Return the runs of (system, values, objectives, method, keys, accepted, data for early ends, early ends)."""
     return _run(*arguments, finish=finish)
 
 
@@ -97,20 +92,20 @@ def _rule(finish: Finish, primals: PyTree, tangents: PyTree) -> tuple[PyTree, Py
     (`LaggedReplayStepping`).
     """
 
-    moves, (given_loop, _, measured, method, *_) = tangents[0], primals[0]
-    refuse_derivative(given_loop, measured, method)
+    moves, (given_system, _, measured, method, *_) = tangents[0], primals[0]
+    refuse_derivative(given_system, measured, method)
     paths = differentiated_paths(moves[0]) | {path for path, move in moves[1].items() if type(move) is not SymbolicZero}
 
     def run(arguments: PyTree) -> PyTree:
         # Only paths with a nonzero tangent are prepared for derivatives.
-        loop, values, objectives, method, *lane_data = arguments
-        loop = prepare_derivatives(loop, paths)
+        hybrid, values, objectives, method, *lane_data = arguments
+        hybrid = prepare_derivatives(hybrid, paths)
         method = (
             LaggedReplayStepping(method.for_replay())
             if isinstance(method, AdaptiveStepping)
             else method.for_derivatives()
         )
-        return _run(loop, values, objectives, method, *lane_data, finish=finish)
+        return _run(hybrid, values, objectives, method, *lane_data, finish=finish)
 
     return jvp_nonzero(run, primals, tangents)
 
@@ -120,9 +115,9 @@ _run_differentiable.defjvp(_rule, symbolic_zeros=True)
 
 @functools.partial(jax.jit, static_argnames="finish")
 def _run(
-    loop: Loop,
-    values: dict[str, PyTree],
-    objectives: dict[str, Objective],
+    hybrid: HybridSystem,
+    values: Params,
+    objectives: Objectives,
     method: PyTree,
     keys: PyTree,
     accepted: Scalar,
@@ -132,7 +127,7 @@ def _run(
     finish: Finish,
 ) -> PyTree:
     """Return the results of all runs; `method` is the stepping method, `early_data` the runs' data for `enough`."""
-    leaves, build_lane = split_by_lane(loop, values, objectives)
+    leaves, build_lane = split_by_lane(hybrid, values, objectives)
 
     def start(lane_leaves: PyTree, key: PyTree, accepted: Scalar) -> PyTree:
         return _stop_unaccepted(accepted, method.start(*build_lane(lane_leaves), key))
@@ -140,14 +135,14 @@ def _run(
     def is_running(lane: PyTree, carry: PyTree) -> Bool:
         if enough is None:
             return carry.running
-        output = build_lane(lane[0])[0].plant.output(carry.point.state.plant)
-        return carry.running & ~enough.has_reached(lane[2], output)
+        sample = sample_now(build_lane(lane[0])[0], carry)
+        return carry.running & ~enough.has_reached(lane[2], sample)
 
     def judge(lane_leaves: object, carry: object) -> PyTree:
         return finish(*build_lane(lane_leaves), carry)[0]
 
     begins = jax.vmap(start)(leaves, keys, accepted)
-    _check_logs(loop, begins.point.state)
+    _check_logs(hybrid, begins.point.state)
     # The kernel computes only leaves of the carry that the results depend on, and tangents that move the results.
     carry = run_lanes(
         lambda lane, carry: method.renew(build_lane(lane[0])[0], carry),
@@ -163,13 +158,13 @@ def _run(
     return jax.vmap(judge)(leaves, carry)
 
 
-def _check_logs(loop: Loop, state: LoopState) -> None:
-    """Raise Unsupported if a block records its past in more rows, shape (runs, rows, n), than a kernel can index."""
-    for name in BLOCKS:
+def _check_logs(hybrid: HybridSystem, state: PyTree) -> None:
+    """Raise Unsupported if a recorder keeps its past in more rows, shape (runs, rows, n), than a kernel can index."""
+    for name in hybrid.recorders:
         for rows in log_rows(getattr(state, name)):
             if rows.shape[1] > MAX_COMPARED_ENTRIES:
                 error = Unsupported("log", f"of {rows.shape[1]} rows; {MAX_COMPARED_ENTRIES} are the most")
-                error.method = f"{type(getattr(loop, name)).__name__}.record"
+                error.method = f"{type(getattr(hybrid, name)).__name__}.record"
                 raise error
 
 
@@ -181,21 +176,20 @@ def _stop_unaccepted(accepted: Scalar, carry: PyTree) -> PyTree:
     return carry._replace(status=status.astype(carry.status.dtype))
 
 
-def kernel_objection(loop: Loop, values: Params, solver: Solver, objectives: Mapping[str, Objective]) -> str | None:
+def find_objection(
+    hybrid: HybridSystem, values: Params, method: PyTree, objectives: Objectives, finish: Finish
+) -> str | None:
     """Return one line with the reason why a kernel cannot make these runs, or None if it can.
 
-    A reason is an operation without a translation, no compiler on this machine, or traced numbers. The function
-    executes no run, but it compiles and keeps the kernel. `values` have at least one path, with columns (runs, ...).
+    A reason is an operation without a translation, or no compiler on this machine. The function executes no run, but it
+    compiles and keeps the kernel. `values` have at least one path, with columns (runs, ...).
     """
     check_process()
-    if is_traced(loop, dict(values), dict(objectives)):
-        return "this is traced; ask with numbers"
-    checked, measured, method = prepare_arguments(loop, solver, objectives)
-    columns = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
-    count = len(next(iter(columns.values())))
+    count = len(next(iter(values.values())))
     keys = jax.vmap(jax.random.key)(jnp.arange(count))
+    arguments = hybrid, values, objectives, method, keys, jnp.ones(count, bool), None, None
     try:
-        _run.lower(checked, columns, dict(measured), method, keys, jnp.ones(count, bool), None, None, finish=finish_run)
+        _run.lower(*arguments, finish=finish)
     except (Unsupported, NoCompiler) as error:
         return str(error)
     return None

@@ -4,7 +4,7 @@ A batch under `jax.vmap` steps until its slowest run ends. Here only `LANES_AT_O
 `STEPS_PER_EXCHANGE` steps the runs that have ended are removed, and the next runs take their places.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -12,16 +12,12 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.first_order import first_order
-from diffabs.core.loop import Loop
-from diffabs.core.protocols import Objective
-from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.core.pytree import replace
 from diffabs.core.tracing import split_batched
 from diffabs.core.types import Array, Bool, Params, PyTree, Scalar, Vector
-from diffabs.engine.arguments import forbid_derivatives, prepare_arguments
 from diffabs.engine.drive.loops import STEPS_PER_BLOCK, MethodCarry
-from diffabs.engine.result import finish_run, prepare
+from diffabs.engine.hybrid import Finish, HybridSystem, Objectives, Sampled
 from diffabs.engine.step.status import RunStatus
-from diffabs.engine.types import Run, Solver
 
 LANES_AT_ONCE = 512  # runs that step at a time: their state stays in a processor's cache
 STEPS_PER_EXCHANGE = 64  # steps between two exchanges of runs
@@ -35,55 +31,59 @@ class EarlyEnd(Protocol):
         """Return the data for run `number` that the condition needs, a pytree."""
         ...
 
-    def has_reached(self, data: object, output: object) -> Bool:
-        """Return True if the run ends, given its `data` and the present `output` of its plant."""
+    def has_reached(self, data: PyTree, sample: Any) -> Bool:
+        """Return True if the run ends, given its `data` and the present `sample` of its signals."""
         ...
 
 
 def run_packed(
-    loop: Loop,
+    hybrid: HybridSystem,
     values: Params,
     keys: object,
-    solver: Solver,
-    objectives: Mapping[str, Objective],
+    method: PyTree,
+    objectives: Objectives,
     accepted: Vector,
+    finish: Finish,
     enough: EarlyEnd | None = None,
     numbers: Array | None = None,
-) -> Run:
-    """Return the results of `measure` for runs that differ in their values and keys. Not for derivatives.
+) -> PyTree:
+    """Return the results, by `finish`, of runs that differ in their values and keys. Not for derivatives.
 
-    A run that is not accepted has diverged. A run that `enough` ends has no end flag. `values` have shape (runs, ...)
-    by dotted path, and `keys`, `accepted` and `numbers`, by which `enough` knows the runs, shape (runs,).
+    A run that is not accepted is over from the beginning. `values` have shape (runs, ...) by dotted path, and `keys`,
+    `accepted` and `numbers`, by which `enough` knows the runs, shape (runs,).
     """
-    loop, objectives, method = prepare_arguments(loop, solver, objectives)
-    values = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
-    values = {**values, **forbid_derivatives(loop, values)}
     numbers = jnp.arange(len(accepted)) if numbers is None else numbers
     # Of the inputs themselves, not of tangents: so already their first derivative is an error.
-    loop, values, objectives = first_order((loop, values, objectives), VALUES_ONLY)
-    return _run(loop, values, objectives, method, keys, accepted, enough, numbers, width=LANES_AT_ONCE)
+    hybrid, values, objectives = first_order((hybrid, values, objectives), VALUES_ONLY)
+    arguments = hybrid, values, objectives, method, keys, accepted, enough, numbers
+    return _run(*arguments, finish=finish, width=LANES_AT_ONCE)
 
 
 def split_by_lane(
-    loop: Loop, values: dict[str, PyTree], objectives: dict[str, Objective]
+    hybrid: HybridSystem, values: Params, objectives: Objectives
 ) -> tuple[PyTree, Callable[[PyTree], tuple[PyTree, PyTree]]]:
-    """Return the leaves of the prepared loops that depend on the values, and a function from those of one run to its
-    loop and objectives, with the plant's audit. All other leaves are computed once.
+    """Return the leaves of the prepared systems that depend on the values, and a function from those of one run to its
+    system and all its objectives. All other leaves are computed once.
     """
-    leaves, whole = split_batched(lambda v: prepare(replace(loop, v)), values)
+    leaves, whole = split_batched(lambda v: replace(hybrid, v).prepare_run(), values)
 
-    def build_lane(lane_leaves: object) -> tuple[Loop, dict[str, Objective]]:
-        lane_loop, audit = whole(lane_leaves)
-        return lane_loop, objectives | audit
+    def build_lane(lane_leaves: object) -> tuple[HybridSystem, Objectives]:
+        lane_system, further = whole(lane_leaves)
+        return lane_system, {**objectives, **further}
 
     return leaves, build_lane
+
+
+def sample_now(hybrid: HybridSystem, carry: MethodCarry) -> Sampled:
+    """Return the sample of a run at its present point."""
+    return hybrid.signals(carry.point.t, carry.point.state).sample
 
 
 class _LaneSlots(NamedTuple):
     """Runs in progress and runs that have ended.
 
     Attributes:
-        leaves: Leaves of the prepared loops that differ between the runs.
+        leaves: Leaves of the prepared systems that differ between the runs.
         keys: Random keys.
         carry: Carries.
         number: Number of the run in each slot; the number of runs in an empty slot.
@@ -96,29 +96,30 @@ class _LaneSlots(NamedTuple):
     carry: MethodCarry
     number: Scalar
     next: Any
-    ended: Run
+    ended: PyTree
 
 
-@partial(jax.jit, static_argnames="width")
+@partial(jax.jit, static_argnames=("finish", "width"))
 def _run(
-    loop: Loop,
-    values: dict[str, PyTree],
-    objectives: dict[str, Objective],
+    hybrid: HybridSystem,
+    values: Params,
+    objectives: Objectives,
     method: PyTree,
     keys: PyTree,
     accepted: Vector,
     enough: EarlyEnd | None,
     numbers: Array,
     *,
+    finish: Finish,
     width: int,
-) -> Run:
+) -> PyTree:
     """Return the results of all runs, in their order; `width` runs step at a time, by the stepping method `method`."""
     count = len(accepted)
-    leaves, build_lane = split_by_lane(loop, values, objectives)
+    leaves, build_lane = split_by_lane(hybrid, values, objectives)
     step_all = jax.vmap(lambda lane_leaves, key, carry: method.step(*build_lane(lane_leaves), key, carry))
     renew_all = jax.vmap(lambda lane_leaves, carry: method.renew(build_lane(lane_leaves)[0], carry))
     start = jax.vmap(lambda lane_leaves, key: method.start(*build_lane(lane_leaves), key))
-    finish = jax.vmap(lambda lane_leaves, carry: finish_run(*build_lane(lane_leaves), carry)[0])
+    finish_all = jax.vmap(lambda lane_leaves, carry: finish(*build_lane(lane_leaves), carry)[0])
 
     def take_lanes(number: Scalar) -> tuple[PyTree, PyTree, MethodCarry]:
         """Return leaves, keys and carries of these runs at t = 0; beyond the last run a copy that does not step."""
@@ -138,11 +139,11 @@ def _run(
             carry=jax.lax.scan(renew_and_step, slots.carry, length=STEPS_PER_EXCHANGE // STEPS_PER_BLOCK)[0]
         )
         free = ~slots.carry.running | _lanes_ended_early(enough, build_lane, slots, numbers)
-        return _exchange_lanes(slots, free, finish, take_lanes, count)
+        return _exchange_lanes(slots, free, finish_all, take_lanes, count)
 
     number = jnp.arange(min(width, count))
     first = take_lanes(number)
-    shapes = jax.eval_shape(finish, first[0], first[2])
+    shapes = jax.eval_shape(finish_all, first[0], first[2])
     ended = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
     slots = _LaneSlots(*first, number, number[-1] + 1, ended)
     return jax.lax.while_loop(lambda slots: jnp.any(slots.number < count), step_and_exchange, slots).ended
@@ -151,20 +152,20 @@ def _run(
 def _lanes_ended_early(
     enough: EarlyEnd | None, build_lane: Callable[[PyTree], PyTree], slots: _LaneSlots, numbers: Array
 ) -> PyTree:
-    """Return True for each slot whose run ends early; `build_lane` returns the loop and objectives of one run."""
+    """Return True for each slot whose run ends early; `build_lane` returns the system and objectives of one run."""
     if enough is None:
         return jnp.zeros_like(slots.carry.running)
-    output = jax.vmap(lambda lane_leaves, at: build_lane(lane_leaves)[0].plant.output(at.point.state.plant))(
+    sample = jax.vmap(lambda lane_leaves, carry: sample_now(build_lane(lane_leaves)[0], carry))(
         slots.leaves, slots.carry
     )
     lane_numbers = numbers[jnp.minimum(slots.number, len(numbers) - 1)]
-    return jax.vmap(lambda number, output: enough.has_reached(enough.data_of(number), output))(lane_numbers, output)
+    return jax.vmap(lambda number, sample: enough.has_reached(enough.data_of(number), sample))(lane_numbers, sample)
 
 
 def _exchange_lanes(
     slots: _LaneSlots,
     free: PyTree,
-    finish: Callable[[PyTree, MethodCarry], Run],
+    finish: Callable[[PyTree, MethodCarry], PyTree],
     take_lanes: Callable[[PyTree], PyTree],
     count: int,
 ) -> _LaneSlots:

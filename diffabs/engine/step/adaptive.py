@@ -29,9 +29,8 @@ import numpy as np
 from diffabs.core.cubic import HermiteStep
 from diffabs.core.lanes import any_lane, select
 from diffabs.core.log import borrow
-from diffabs.core.loop import Loop, LoopState
 from diffabs.core.types import Any, AnyArray, Array, Bool, Int, Key, PyTree, Scalar
-from diffabs.engine.result import observe
+from diffabs.engine.hybrid import HybridSystem, State
 from diffabs.engine.step.advance import (
     Carry,
     Decision,
@@ -71,8 +70,7 @@ from diffabs.engine.step.surfaces import (
     is_surface_moving,
     time_since_crossing,
 )
-from diffabs.engine.step.system import Evaluation, LoopSystem, Objectives
-from diffabs.engine.types import Trajectory
+from diffabs.engine.step.system import Evaluation, Objectives, ObservedSystem
 
 MIN_RTOL_EPS = 32  # multiples of machine epsilon: the smallest error that a step can reach
 DERIVATIVE_RTOL_FRACTION = 0.03  # fraction of the allowed error of a step, for derivatives
@@ -108,10 +106,10 @@ class StateSpan(NamedTuple):
         flow: Its integrated part over the step.
     """
 
-    state: LoopState
+    state: State
     flow: HermiteStep
 
-    def at(self, t: Scalar) -> LoopState:
+    def at(self, t: Scalar) -> State:
         """Return the state at a time `t` [s] within the step."""
         return self.state.with_flow(self.flow.at(t))
 
@@ -122,7 +120,7 @@ class AdaptiveControl(NamedTuple):
     Attributes:
         error_limited: Length that the error allows [s].
         limit: Longest stable step [s].
-        scale: Largest values of the first signal and of the states so far, as `error_scales` returns them.
+        scale: Largest values of the leading signals and of the states so far, as `error_scales` returns them.
         tries: Number of attempts so far.
         tries_at_renewal: Number of attempts at the last update of the stability limit.
         last_step: Last step, a `StateSpan`; () without a trajectory.
@@ -150,7 +148,7 @@ class AdaptiveReport(NamedTuple):
 
     Attributes:
         error: Error as a multiple of the allowed error.
-        scale: Largest values of the first signal and of the states so far, as `error_scales` returns them.
+        scale: Largest values of the leading signals and of the states so far, as `error_scales` returns them.
         past_crossing: Time from the first change of a comparison inside the step, or the first turn of a margin beyond
             zero, to the end of the step [s]; 0 without one.
         grazes: True if a margin only touches zero, or crosses it twice in a step that is too short to be cut.
@@ -209,30 +207,30 @@ class AdaptiveStepping:
         rounding = MIN_STEP_EPS * jnp.finfo(self.h.dtype).eps
         return self.h * self.steps * jnp.maximum(MIN_LOCATION_FRACTION, rounding)
 
-    def start(self, loop: Loop, objectives: Objectives, key: Key) -> Carry:
-        """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
+    def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> Carry:
+        """Return the carry of a run at t = 0, from `hybrid`, `objectives` and random `key`."""
         error_limited = jnp.minimum(INITIAL_STEP_S, self.h * self.steps) + 0.0 * self.h
         foresee = partial(self._look_ahead, error_limited, jnp.asarray(False), jnp.asarray(True))
-        carry = start_carry(self, loop, objectives, key, foresee)
+        carry = start_carry(self, hybrid, objectives, key, foresee)
         point, zero, no = carry.point, carry.k, carry.unrestricted
         state = borrow(point.state, None)
         scale = error_scales(state, point.sample)
-        limit = self._find_stability_limit(loop, point.t, state, scale) if self.stable else self.h * self.steps
-        to_strike = self._next_strike(loop, zero) * self.h
+        limit = self._find_stability_limit(hybrid, point.t, state, scale) if self.stable else self.h * self.steps
+        to_strike = self._next_strike(hybrid, zero) * self.h
         length, strikes = plan_step(jnp.minimum(error_limited, limit), self._ahead(point), to_strike)
         last = span_step(point, point) if self.keeps_last_step else ()
         control = AdaptiveControl(error_limited, limit, scale, zero, zero, last, zero, 1.0 + 0.0 * self.h, no, zero)
         return cast_floats(carry._replace(length=length, base=length, strikes=strikes, control=control), self.h.dtype)
 
-    def renew(self, loop: Loop, carry: Carry) -> Carry:
-        """Return the `carry` with a new stability limit of the `loop`, once in `ATTEMPTS_PER_RENEWAL` attempts."""
+    def renew(self, hybrid: HybridSystem, carry: Carry) -> Carry:
+        """Return the `carry` with a new stability limit of the `hybrid`, once in `ATTEMPTS_PER_RENEWAL` attempts."""
         if not self.stable:
             return carry
         control, at = carry.control, carry.point
         due = carry.running & (control.tries - control.tries_at_renewal >= ATTEMPTS_PER_RENEWAL)
 
         def renew_due() -> Scalar:
-            new = self._find_stability_limit(loop, at.t, at.state, control.scale)
+            new = self._find_stability_limit(hybrid, at.t, at.state, control.scale)
             return jnp.where(due, new, control.limit)
 
         # One condition for the whole batch: `cond` with one for each run would execute both branches.
@@ -244,13 +242,13 @@ class AdaptiveStepping:
         """Return True if the run of `carry` goes on and has not reached the instant `until` of the grid."""
         return carry.running if until is None else carry.running & (carry.point.t < until * self.h)
 
-    def observe_at(self, loop: Loop, carry: Carry, instant: Scalar) -> Trajectory:
-        """Return the signals of the `loop` at this `instant` of the grid, which lies within the last step."""
+    def state_at(self, carry: Carry, instant: Scalar) -> tuple[Any, State, Bool]:
+        """Return time, state, and whether the run goes on, at an `instant` of the grid within the last step."""
         now, t, last = carry.point, instant * self.h, carry.control.last_step
         # The last step is a cubic, so the instant may lie anywhere in it. A run that is over shows its last point.
         inside = (t < now.t) & (last.flow.end > last.flow.start)
         t, state = select(inside, (t, last.at(t)), (now.t, borrow(now.state, None)))
-        return observe(loop, t, state, carry.running | inside)
+        return t, state, carry.running | inside
 
     def for_replay(self) -> "AdaptiveStepping":
         """Return the method for a run that is logged and then replayed with derivatives.
@@ -261,18 +259,18 @@ class AdaptiveStepping:
         rtol = clip_rtol(DERIVATIVE_RTOL_FRACTION * self.rtol)
         return dataclasses.replace(self, keeps_mode=not self.smooth, stable=True, rtol=rtol)
 
-    def is_switched(self, loop: Loop) -> bool:
-        """Return True: the comparisons of the `loop`'s flow are always visible."""
-        del loop
+    def is_switched(self, hybrid: HybridSystem) -> bool:
+        """Return True: the comparisons of the `hybrid`'s flow are always visible."""
+        del hybrid
         return True
 
     def is_calm(self, carry: Carry) -> Bool:
         """Return True if the attempt of `carry` is not far shorter than the error allows."""
         return carry.length > RESET_STEP_FRACTION * carry.control.error_limited
 
-    def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
+    def propose(self, system: ObservedSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
-        return propose_step(self, system, carry, self._next_strike(system.loop, carry.k), frozen=self.keeps_mode)
+        return propose_step(self, system, carry, self._next_strike(system.hybrid, carry.k), frozen=self.keeps_mode)
 
     def forecast(self, carry: Carry, dynamics: Evaluation) -> PyTree:
         """Return the predicted time [s] to the first change of an answer, and an `Outlook`.
@@ -283,7 +281,7 @@ class AdaptiveStepping:
         return self._look_ahead(carry.control.error_limited, carry.unrestricted, fresh, dynamics)
 
     def report(
-        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: PyTree
+        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: State, error: PyTree
     ) -> AdaptiveReport:
         """Return the error of an attempt, and the comparisons that change in it."""
         sample, point = dynamics.signals.sample, carry.point
@@ -297,7 +295,7 @@ class AdaptiveStepping:
             lambda before, now: jnp.where(starts & (before == 0), jnp.inf, now), carry.control.scale, scale
         )
         state_errors = midpoint_error(self.tableau, error[0], dynamics.rates[0], h)
-        relative = error_norm(system.loop, state, state_errors, scales, sample) / self.rtol
+        relative = error_norm(system.hybrid, state, state_errors, scales, sample) / self.rtol
         if self.smooth:
             return AdaptiveReport(relative, scale, jnp.zeros_like(h), jnp.asarray(False), jnp.asarray(-1), None)
         surface = find_surface_crossing(dynamics, carry.search.number, h) if self.keeps_mode else None
@@ -314,7 +312,7 @@ class AdaptiveStepping:
         return AdaptiveReport(relative, scale, jnp.where(resolved, past_crossing, 0.0), grazes, returns, surface)
 
     def decide(
-        self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
+        self, system: ObservedSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
     ) -> Decision:
         """Return the decision: the error must be small, and no comparison may change within the attempt."""
         error, past_crossing = attempt.report.error, attempt.report.past_crossing
@@ -323,7 +321,9 @@ class AdaptiveStepping:
         last = request.strikes & (request.strike >= self.steps)
         return decide_attempt(self, system, carry, attempt, active, valid, exact, last=last, frozen=self.keeps_mode)
 
-    def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+    def plan_next(
+        self, system: ObservedSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
+    ) -> Carry:
         """Return the carry `after` an `attempt` with length and status of the next attempt."""
         control, report, accepted = carry.control, attempt.report, decision.accepted
         new = carry.status == RunStatus.RUNNING
@@ -333,7 +333,7 @@ class AdaptiveStepping:
             grown = jnp.minimum(STABILITY_FRACTION_GROWTH * fraction, 1.0)
             fraction = jnp.where(accepted, jnp.where(new, grown, INITIAL_STABILITY_FRACTION), fraction)
         longest = jnp.maximum(jnp.minimum(error_limited, fraction * control.limit), shortest_step(after.point.t))
-        to_strike = (self._next_strike(system.loop, after.k) - after.k) * self.h - after.since
+        to_strike = (self._next_strike(system.hybrid, after.k) - after.k) * self.h - after.since
         length, strikes = plan_step(longest, self._ahead(after.point), to_strike)
         # A comparison changed inside the step: the next attempt ends there.
         ends_on_crossing = ~accepted & (report.past_crossing > 0) & decision.valid
@@ -408,9 +408,9 @@ class AdaptiveStepping:
         status = jnp.where(report.grazes, RunStatus.GRAZED, status)
         return jnp.where(slides, RunStatus.SLID, status)
 
-    def _find_stability_limit(self, loop: Loop, t: Array, state: LoopState, scale: Array) -> Scalar:
-        """Return the longest stable step [s]; the whole span if the Jacobian of the `loop` is not finite."""
-        limit = spectral_step_limit(loop, t, state, scale)
+    def _find_stability_limit(self, hybrid: HybridSystem, t: Array, state: State, scale: Array) -> Scalar:
+        """Return the longest stable step [s]; the whole span if the Jacobian of the `hybrid` is not finite."""
+        limit = spectral_step_limit(hybrid, t, state, scale)
         return jnp.where(limit > 0, limit, self.h * self.steps)  # False also for NaN
 
     def _ahead(self, point: Point) -> Scalar:
@@ -429,9 +429,9 @@ class AdaptiveStepping:
         """Return the dynamics with those margins only whose turns are looked for: of events, or all if it `watches`."""
         return dynamics if self.watches else dynamics._replace(surfaces=[])
 
-    def _next_strike(self, loop: Loop, k: Int) -> Int:
+    def _next_strike(self, hybrid: HybridSystem, k: Int) -> Int:
         """Return the number of the first grid instant after the `k`-th at which a clock strikes or the run ends."""
-        return jnp.minimum(loop.next_tick(k, self.h), self.steps) if loop.ticks else self.steps
+        return jnp.minimum(hybrid.next_tick(k, self.h), self.steps) if hybrid.ticks else self.steps
 
     def _forecast_crossing(self, error_limited: Scalar, unrestricted: Bool, dynamics: Evaluation) -> Scalar:
         ahead = forecast_crossing(dynamics.surfaces, error_limited, self.closest)

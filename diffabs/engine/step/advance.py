@@ -19,9 +19,9 @@ from jax.typing import DTypeLike
 
 from diffabs.core.lanes import any_lane, jit_barrier, keep_decision, select
 from diffabs.core.log import borrow, log_rows, write_last_rows
-from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.protocols import Clock
 from diffabs.core.types import Array, Bool, Int, PyTree, Scalar
+from diffabs.engine.hybrid import HybridSystem, Margins, State
 from diffabs.engine.step.attempt import (
     Attempt,
     Point,
@@ -46,7 +46,7 @@ from diffabs.engine.step.modes import Mode
 from diffabs.engine.step.runge_kutta import Tableau
 from diffabs.engine.step.slides import init_watch, watch_landing
 from diffabs.engine.step.status import RunStatus, is_running, status_after_step
-from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, LoopSystem, Objectives, build_system
+from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, Objectives, ObservedSystem, build_system
 
 
 class Carry(NamedTuple):
@@ -144,15 +144,15 @@ class Stepping(Protocol):
         """Return True if the run of `carry` goes on and has not reached the instant `until` of the grid."""
         ...
 
-    def is_switched(self, loop: Loop) -> bool:
-        """Return True if the comparisons of the `loop`'s flow are visible."""
+    def is_switched(self, hybrid: HybridSystem) -> bool:
+        """Return True if the comparisons of the `hybrid`'s flow are visible."""
         ...
 
     def is_calm(self, carry: Carry) -> Bool:
         """Return True if the attempt of `carry` is so long that an earlier landing is over."""
         ...
 
-    def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
+    def propose(self, system: ObservedSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
         ...
 
@@ -164,7 +164,7 @@ class Stepping(Protocol):
         ...
 
     def report(
-        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: object
+        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: State, error: object
     ) -> Any:
         """Return the findings about an attempt, by the run of `carry` in `system`, that the method needs.
 
@@ -174,7 +174,7 @@ class Stepping(Protocol):
         ...
 
     def decide(
-        self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
+        self, system: ObservedSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
     ) -> Decision:
         """Return the decision on the `attempt` that answers the `request`, by the run of `carry` in `system`.
 
@@ -182,7 +182,9 @@ class Stepping(Protocol):
         """
         ...
 
-    def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+    def plan_next(
+        self, system: ObservedSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
+    ) -> Carry:
         """Return the carry `after` an `attempt` with length and status of the next attempt.
 
         `carry` is the run in `system` before the attempt, and `decision` the decision on it. `after` has the new point
@@ -192,7 +194,12 @@ class Stepping(Protocol):
 
 
 def advance(
-    stepping: Stepping, loop: Loop, objectives: Objectives, key: PyTree, carry: Carry, until: Int | None = None
+    stepping: Stepping,
+    hybrid: HybridSystem,
+    objectives: Objectives,
+    key: PyTree,
+    carry: Carry,
+    until: Int | None = None,
 ) -> Carry:
     """Return the carry after one attempt of a step.
 
@@ -205,8 +212,8 @@ def advance(
     start = carry.point._replace(state=borrow(carry.point.state, None))
     carry = carry._replace(point=start)
     system = build_system(
-        *(loop, objectives, start.t, start.state, start.accumulators),
-        switched=stepping.is_switched(loop),
+        *(hybrid, objectives, start.t, start.state, start.accumulators),
+        switched=stepping.is_switched(hybrid),
         has_margin_rates=stepping.has_margin_rates,
     )
     request, forecast = stepping.propose(system, carry), partial(stepping.forecast, carry)
@@ -230,7 +237,7 @@ def advance(
         return commit_step(system, start, attempt, clock, decision.triggered, decision.mode, logs, forecast)
 
     # Where a run ends, no block changes any more.
-    point = select(decision.over, attempt.point, jit_barrier(active, commit) if loop.changes else commit())
+    point = select(decision.over, attempt.point, jit_barrier(active, commit) if hybrid.changes else commit())
     point = select(decision.accepted, point, start)
     since = jnp.where(strikes, 0.0, jnp.where(decision.accepted, carry.since + request.h, carry.since))
     after = carry._replace(point=point, k=k, since=since)
@@ -252,7 +259,7 @@ def advance(
 
 
 def _search(
-    stepping: Stepping, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
+    stepping: Stepping, system: ObservedSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
 ) -> Carry:
     """Return the carry `after` an attempt with the search for an event continued, and with the next status."""
     plan = SearchPlan(carry.search, carry.length, carry.status)
@@ -271,14 +278,14 @@ def _search(
     return after._replace(search=search, length=length, status=status)
 
 
-def _next_status(system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, status: Scalar) -> Scalar:
+def _next_status(system: ObservedSystem, carry: Carry, attempt: Attempt, decision: Decision, status: Scalar) -> Scalar:
     """Return the status after an attempt; `status` where it was not accepted."""
-    return jnp.where(decision.accepted, status_after_step(system.loop, carry, attempt, decision), status)
+    return jnp.where(decision.accepted, status_after_step(system.hybrid, carry, attempt, decision), status)
 
 
 def start_carry(
     stepping: Stepping,
-    loop: Loop,
+    hybrid: HybridSystem,
     objectives: Objectives,
     key: PyTree,
     forecast: Callable[[Evaluation], PyTree] = lambda dynamics: (),
@@ -289,11 +296,11 @@ def start_carry(
     """
     none, zero = 0.0 * stepping.h, jnp.asarray(0)
     # With the types of later steps the loop is traced once for all of them.
-    state, accumulators = cast_floats(start_state(loop, objectives, Clock(none, stepping.h, zero, key)), none.dtype)
+    state, accumulators = cast_floats(start_state(hybrid, objectives, Clock(none, stepping.h, zero, key)), none.dtype)
     logs, state = log_rows(state), borrow(state, None)
     system = build_system(
-        *(loop, objectives, none, state, accumulators),
-        switched=stepping.is_switched(loop),
+        *(hybrid, objectives, none, state, accumulators),
+        switched=stepping.is_switched(hybrid),
         has_margin_rates=stepping.has_margin_rates,
     )
     point = evaluate_point(system, none, state, accumulators, UNCONSTRAINED, forecast)
@@ -304,7 +311,7 @@ def start_carry(
     return Carry(point, zero, none, stepping.h, yes, stepping.h, search, no, slides, (), status)
 
 
-def propose_step(stepping: Stepping, system: LoopSystem, carry: Carry, strike: Int, *, frozen: bool) -> StepRequest:
+def propose_step(stepping: Stepping, system: ObservedSystem, carry: Carry, strike: Int, *, frozen: bool) -> StepRequest:
     """Return the step to attempt next, which keeps to a mode if `frozen`.
 
     `strike` is the number of the next instant at which a clock strikes, or the run ends.
@@ -320,7 +327,7 @@ def propose_step(stepping: Stepping, system: LoopSystem, carry: Carry, strike: I
 
 def decide_attempt(
     stepping: Stepping,
-    system: LoopSystem,
+    system: ObservedSystem,
     carry: Carry,
     attempt: Attempt,
     active: Bool,

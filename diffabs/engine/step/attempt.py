@@ -17,18 +17,17 @@ import jax.numpy as jnp
 from diffabs.core.cubic import HermiteStep
 from diffabs.core.lanes import select
 from diffabs.core.log import borrow
-from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.numerics import axpy
-from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
+from diffabs.core.protocols import Clock, Memory, Segment
 from diffabs.core.types import Any, Array, Bool, Int, PyTree, Scalar
+from diffabs.engine.hybrid import HybridSystem, Margins, Objectives, Signals, State
 from diffabs.engine.step.modes import Mode, ModeBits, single_bit
 from diffabs.engine.step.runge_kutta import Tableau, runge_kutta_step
 from diffabs.engine.step.surfaces import valid_end_rates
 from diffabs.engine.step.system import (
     Accumulators,
     Evaluation,
-    LoopSystem,
-    Objectives,
+    ObservedSystem,
     split_flow_and_held,
     with_flow,
 )
@@ -39,10 +38,10 @@ class Point(NamedTuple):
 
     Attributes:
         t: Time [s].
-        state: State of the loop.
+        state: State of the system.
         accumulators: Accumulators of the objectives.
         sample: Sample of the signals.
-        signal_rates: Rates of the signals, as `LoopSystem.signal_rates` says.
+        signal_rates: Rates of the signals, as `ObservedSystem.signal_rates` says.
         recorded: Signals that blocks record, and their rates, each by block.
         rates: Rates of the loop's flow and of the objectives' integrals.
         margins: Margins of the stop and of the blocks' events.
@@ -51,9 +50,9 @@ class Point(NamedTuple):
     """
 
     t: Array
-    state: LoopState
+    state: State
     accumulators: Accumulators
-    sample: Sample
+    sample: PyTree
     signal_rates: PyTree
     recorded: tuple[dict[str, PyTree], dict[str, PyTree]]
     rates: tuple[PyTree, PyTree]
@@ -106,38 +105,38 @@ class Attempt(NamedTuple):
 Forecast = Callable[[Evaluation], PyTree]  # `Stepping.forecast`, for a run
 
 
-def start_state(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopState, Accumulators]:
+def start_state(hybrid: HybridSystem, objectives: Objectives, clock: Clock) -> tuple[State, Accumulators]:
     """Return state and accumulators at t = 0, after the first ticks and the events of blocks with a negative margin."""
-    state = loop.start()
-    signals = loop.signals(clock.t, state)
+    state = hybrid.start()
+    signals = hybrid.signals(clock.t, state)
     accumulators = {name: objective.start(signals.sample) for name, objective in objectives.items()}
-    if loop.changes:
-        margins = loop.margins(clock.t, state, signals, lambda: loop.flow(clock.t, state, signals))
-        state = loop.change(clock, state, signals, margins, jax.tree.map(lambda margin: margin < 0, margins))
+    if hybrid.changes:
+        margins = hybrid.margins(clock.t, state, signals, lambda: hybrid.flow(clock.t, state, signals))
+        state = hybrid.change(clock, state, signals, margins, jax.tree.map(lambda margin: margin < 0, margins))
     return state, accumulators
 
 
 def evaluate_point(
-    system: LoopSystem, t: Array, state: LoopState, accumulators: Accumulators, mode: Mode, forecast: Forecast
+    system: ObservedSystem, t: Array, state: State, accumulators: Accumulators, mode: Mode, forecast: Forecast
 ) -> Point:
     """Return the point at an instant, from the state after the changes there."""
     return _build_point(system.evaluate(t, state, accumulators, mode), t, state, accumulators, forecast)
 
 
 def attempt_step(
-    system: LoopSystem,
+    system: ObservedSystem,
     point: Point,
     request: StepRequest,
     tableau: Tableau,
     forecast: Forecast,
-    report: Callable[[Evaluation, LoopState, PyTree], PyTree],
+    report: Callable[[Evaluation, State, PyTree], PyTree],
 ) -> Attempt:
     """Return the end of one Runge-Kutta step from a point.
 
     `report` returns what the stepping method needs for its decision, from the dynamics at the end, the state there, and
     the shares of the rates in the error.
     """
-    loop, (t, h), mode = system.loop, (request.end, request.h), request.mode
+    hybrid, (t, h), mode = system.hybrid, (request.end, request.h), request.mode
     z, held = split_flow_and_held(point.state, point.accumulators)
 
     def flow(t: Scalar, z: object, constants: tuple[PyTree, Mode]) -> PyTree:
@@ -150,7 +149,7 @@ def attempt_step(
         shift = request.shift_end(dynamics)
         t, h, z = t + shift, h + shift, axpy(shift, dynamics.rates, z)
     state, accumulators = with_flow(point.state, point.accumulators, z)
-    projected = state._replace(plant=loop.plant.project(state.plant))
+    projected = hybrid.project(state)
     # A projection may move the state onto a switching surface, so the end of a frozen mode is evaluated without it.
     frozen = mode.words is not None and system.program is not None
     state = select(mode.free, projected, state) if frozen else projected
@@ -165,13 +164,13 @@ def attempt_step(
     rates = (point.signal_rates, dynamics.signal_rates)
     segment = Segment(
         *(point.sample, dynamics.signals.sample, h, request.grid),
-        shown_rates=lambda: (Shown.of(rates[0]), Shown.of(rates[1])),
+        shown_rates=lambda: (rates[0].shown(), rates[1].shown()),
         sample_rates=lambda: rates,
         smooth=smooth,
         within=within,
     )
     updated = {name: Memory(z[1][name], o.update(accumulators[name], segment)) for name, o in system.objectives.items()}
-    if not loop.ticks and (loop.eventful or frozen):
+    if not hybrid.ticks and (hybrid.eventful or frozen):
         # A step of length 0 must not count twice in the objectives.
         updated = select(request.refresh, point.accumulators, updated)
     end = _build_point(dynamics, t, projected, updated, forecast)
@@ -179,7 +178,7 @@ def attempt_step(
 
 
 def commit_step(
-    system: LoopSystem,
+    system: ObservedSystem,
     point: Point,
     attempt: Attempt,
     clock: Clock,
@@ -194,22 +193,22 @@ def commit_step(
     are rare, so this is cheaper than an evaluation after every step. `logs` are the rows that `advance` has taken out
     of the state (`core.log`).
     """
-    loop, end = system.loop, attempt.point
+    hybrid, end = system.hybrid, attempt.point
     state = end.state
-    if loop.changes:
+    if hybrid.changes:
         (values, rates), (last, last_rates) = point.recorded, end.recorded
         passed = {
             name: HermiteStep(point.t, end.t, (values[name], last[name]), (rates[name], last_rates[name]))
             for name in values
         }
         lent = borrow(state, logs)
-        state = borrow(loop.change(clock, lent, attempt.signals, end.margins, triggered, passed), None)
-    if loop.ticks:
+        state = borrow(hybrid.change(clock, lent, attempt.signals, end.margins, triggered, passed), None)
+    if hybrid.ticks:
         return evaluate_point(system, end.t, state, end.accumulators, mode, forecast)
     return end._replace(state=state, words=end.words if mode.words is None else mode.words)
 
 
-def mode_in_step(system: LoopSystem, words: ModeBits, free: Bool) -> Mode:
+def mode_in_step(system: ObservedSystem, words: ModeBits, free: Bool) -> Mode:
     """Return the mode of a step in which the comparisons keep the answers `words`.
 
     Where it is `free`, each stage evaluates its comparisons, across switching surfaces.
@@ -218,7 +217,7 @@ def mode_in_step(system: LoopSystem, words: ModeBits, free: Bool) -> Mode:
     return Mode(words, free, tuple(jnp.where(free, all, none) for _ in range(system.word_count)))
 
 
-def mode_after_changes(system: LoopSystem, words: ModeBits, number: Array, lands: Bool) -> Mode:
+def mode_after_changes(system: ObservedSystem, words: ModeBits, number: Array, lands: Bool) -> Mode:
     """Return the mode in which the dynamics are evaluated after the changes at the end of a step.
 
     If it `lands` on the switching surface of a comparison, that one keeps its answer in `words`, those of
@@ -228,15 +227,13 @@ def mode_after_changes(system: LoopSystem, words: ModeBits, number: Array, lands
     return Mode(words, ~lands, tuple(~bit for bit in frozen))
 
 
-def flip_answer(system: LoopSystem, words: ModeBits, number: Array, lands: Bool) -> ModeBits:
+def flip_answer(system: ObservedSystem, words: ModeBits, number: Array, lands: Bool) -> ModeBits:
     """Return the answers with that of one comparison reversed where a step `lands` on its switching surface."""
     bits = single_bit(number, system.word_count)
     return tuple(word ^ jnp.where(lands, bit, jnp.uint32(0)) for word, bit in zip(words, bits, strict=True))
 
 
-def _build_point(
-    dynamics: Evaluation, t: Any, state: LoopState, accumulators: Accumulators, forecast: Forecast
-) -> Point:
+def _build_point(dynamics: Evaluation, t: Any, state: State, accumulators: Accumulators, forecast: Forecast) -> Point:
     signals = dynamics.signals
     return Point(
         *(t, state, accumulators, signals.sample, dynamics.signal_rates, (signals.recorded, dynamics.recorded_rates)),

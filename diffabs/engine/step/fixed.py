@@ -15,9 +15,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.loop import Loop, LoopState
 from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
-from diffabs.engine.result import observe
+from diffabs.engine.hybrid import HybridSystem, State
 from diffabs.engine.step.advance import (
     Carry,
     Decision,
@@ -34,8 +33,7 @@ from diffabs.engine.step.outlook import look_ahead, watch_margins
 from diffabs.engine.step.runge_kutta import RK4
 from diffabs.engine.step.slides import begin_slide
 from diffabs.engine.step.status import RunStatus
-from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, LoopSystem, Objectives
-from diffabs.engine.types import Trajectory
+from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, Objectives, ObservedSystem
 
 EVENT_ATTEMPTS_PER_STEP, SPARE_ATTEMPTS = 4, 64  # attempts to locate events: for each step of the grid, and in addition
 CROSSING_ATTEMPTS_PER_STEP = 1  # attempts on switching surfaces per step of the grid; beyond, steps are unrestricted
@@ -107,31 +105,31 @@ class FixedStepping:
         """True if the rates of all margins are evaluated."""
         return self.watches
 
-    def start(self, loop: Loop, objectives: Objectives, key: Key) -> Carry:
-        """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
+    def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> Carry:
+        """Return the carry of a run at t = 0, from `hybrid`, `objectives` and random `key`."""
         foresee = partial(look_ahead, jnp.asarray(True)) if self.watches else lambda dynamics: ()
-        carry = start_carry(self, loop, objectives, key, foresee)
+        carry = start_carry(self, hybrid, objectives, key, foresee)
         return cast_floats(carry._replace(control=FixedStepControl(carry.k, carry.k)), self.h.dtype)
 
-    def renew(self, loop: Loop, carry: Carry) -> Carry:
-        """Return the `carry` unchanged: fixed steps of a `loop` need no update between blocks."""
-        del loop
+    def renew(self, hybrid: HybridSystem, carry: Carry) -> Carry:
+        """Return the `carry` unchanged: fixed steps of a `hybrid` need no update between blocks."""
+        del hybrid
         return carry
 
     def is_active(self, carry: Carry, until: Int | None) -> Bool:
         """Return True if the run of `carry` goes on and has not reached the instant `until` of the grid."""
         return carry.running if until is None else carry.running & (carry.k < until)
 
-    def observe_at(self, loop: Loop, carry: Carry, instant: Scalar) -> Trajectory:
-        """Return the signals of the `loop` at this `instant` of the grid, which the `carry` has reached."""
+    def state_at(self, carry: Carry, instant: Scalar) -> tuple[Array, State, Bool]:
+        """Return time, state, and whether the run goes on, at an `instant` of the grid that the `carry` has reached."""
         del instant
-        return observe(loop, carry.point.t, carry.point.state, carry.running)
+        return carry.point.t, carry.point.state, carry.running
 
     def for_derivatives(self) -> "FixedStepping":
         """Return the method for derivatives of both orders: it locates switching surfaces unless `kinks` is False."""
         return dataclasses.replace(self, kinks=self.kinks is not False, second_order=True)
 
-    def capacity(self, loop: Loop, steps: int) -> int:
+    def capacity(self, hybrid: HybridSystem, steps: int) -> int:
         """Return the capacity of a scan for this number of `steps`: the greatest usual number of attempts.
 
         An event takes at least four attempts. One of them is REFINING, which `FixedStepControl.extra` does not count.
@@ -139,18 +137,18 @@ class FixedStepping:
         if self.smooth:
             return steps
         crossings = CROSSING_ATTEMPTS_PER_STEP if self.kinks is not False else 0
-        about = (crossings + (EVENT_ATTEMPTS_PER_STEP if loop.eventful else 0)) * steps + SPARE_ATTEMPTS
+        about = (crossings + (EVENT_ATTEMPTS_PER_STEP if hybrid.eventful else 0)) * steps + SPARE_ATTEMPTS
         return steps + SPARE_ATTEMPTS + about + about // 3
 
-    def is_switched(self, loop: Loop) -> bool:
-        """Return True if the comparisons of the `loop`'s flow are visible."""
-        return loop.jumps if self.kinks is None else self.kinks
+    def is_switched(self, hybrid: HybridSystem) -> bool:
+        """Return True if the comparisons of the `hybrid`'s flow are visible."""
+        return hybrid.jumps if self.kinks is None else self.kinks
 
     def is_calm(self, carry: Carry) -> Bool:
         """Return True if the attempt of `carry` goes to the grid, and is no short rest of a step."""
         return carry.strikes & (carry.length > CALM_STEP_FRACTION * self.h)
 
-    def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
+    def propose(self, system: ObservedSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
         strike = carry.k + 1
         if self.smooth:
@@ -163,7 +161,7 @@ class FixedStepping:
         return look_ahead(carry.status == RunStatus.REFRESHING, dynamics) if self.watches else ()
 
     def report(
-        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: object
+        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: State, error: object
     ) -> FixedStepReport:
         """Return the comparisons that an attempt contradicts at its end, and whether a margin grazes zero."""
         del state, error
@@ -174,7 +172,7 @@ class FixedStepping:
         return FixedStepReport(surface, jnp.asarray(grazes))
 
     def decide(
-        self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
+        self, system: ObservedSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
     ) -> Decision:
         """Return the decision: the numbers must be finite and, within a mode, plausible."""
         end = attempt.point
@@ -186,7 +184,9 @@ class FixedStepping:
         frozen = system.program is not None
         return decide_attempt(self, system, carry, attempt, active, valid, valid, last=last, frozen=frozen)
 
-    def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+    def plan_next(
+        self, system: ObservedSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
+    ) -> Carry:
         """Return `after` with length and status of the next attempt, which goes to the grid or continues the search."""
         if self.smooth:
             return after._replace(status=jnp.where(decision.valid, after.status, RunStatus.DIVERGED))

@@ -23,16 +23,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.lanes import any_lane, select
-from diffabs.core.loop import Loop, LoopState
 from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
+from diffabs.engine.hybrid import HybridSystem, State
+from diffabs.engine.solvers import ADAPTIVE_ERROR_ORDER, Adaptive
 from diffabs.engine.step.adaptive import AdaptiveStepping, StateSpan, clip_rtol, span_step
 from diffabs.engine.step.advance import Carry, Decision, advance, cast_floats, start_carry
 from diffabs.engine.step.attempt import Attempt, StepRequest, mode_in_step
 from diffabs.engine.step.modes import ModeBits
 from diffabs.engine.step.runge_kutta import TSIT5
 from diffabs.engine.step.status import RunStatus
-from diffabs.engine.step.system import Evaluation, LoopSystem, Objectives
-from diffabs.engine.types import ADAPTIVE_ERROR_ORDER, Adaptive
+from diffabs.engine.step.system import Evaluation, Objectives, ObservedSystem
 
 # Capacity of the log: attempts at an rtol of 1e-5, and attempts for each instant of a grid with clocks.
 BASE_LOG_CAPACITY, LOG_CAPACITY_PER_TICK = 4096, 3
@@ -104,27 +104,27 @@ class ReplayStepping:
         """Step of the grid [s]."""
         return self.live.h
 
-    def start(self, loop: Loop, objectives: Objectives, key: Key) -> Carry:
-        """Return the carry of a replay at t = 0, from `loop`, `objectives` and random `key`."""
-        carry = start_carry(self, loop, objectives, key)
+    def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> Carry:
+        """Return the carry of a replay at t = 0, from `hybrid`, `objectives` and random `key`."""
+        carry = start_carry(self, hybrid, objectives, key)
         last = span_step(carry.point, carry.point) if self.live.keeps_last_step else ()
         control = ReplayControl(jnp.zeros_like(self.h), last)
         # A run whose start is over has no logged attempt.
         running = jnp.asarray(RunStatus.RUNNING.value)
         return cast_floats(carry._replace(control=control, search=(), status=running), self.h.dtype)
 
-    def step(self, loop: Loop, objectives: Objectives, key: Key, carry: Carry, entry: StepLog) -> Carry:
+    def step(self, hybrid: HybridSystem, objectives: Objectives, key: Key, carry: Carry, entry: StepLog) -> Carry:
         """Return the `carry` after the logged attempt `entry`, unchanged if the attempt was not accepted."""
-        return advance(dataclasses.replace(self, entry=entry), loop, objectives, key, carry)
+        return advance(dataclasses.replace(self, entry=entry), hybrid, objectives, key, carry)
 
     def is_active(self, carry: Carry, until: Int | None) -> Bool:
         """Return True if the logged attempt was accepted; `carry` and `until` have no influence."""
         del carry, until
         return self.entry.accepted
 
-    def is_switched(self, loop: Loop) -> bool:
-        """Return True: the comparisons of the `loop`'s flow are always visible."""
-        del loop
+    def is_switched(self, hybrid: HybridSystem) -> bool:
+        """Return True: the comparisons of the `hybrid`'s flow are always visible."""
+        del hybrid
         return True
 
     def is_calm(self, carry: Carry) -> Bool:
@@ -132,7 +132,7 @@ class ReplayStepping:
         del carry
         return jnp.asarray(True)
 
-    def propose(self, system: LoopSystem, carry: Carry) -> StepRequest:
+    def propose(self, system: ObservedSystem, carry: Carry) -> StepRequest:
         """Return the logged attempt.
 
         If the last step ended late, this one is shorter: it aims at the logged time, and `shift_end` may move its end.
@@ -160,14 +160,14 @@ class ReplayStepping:
         return ()
 
     def report(
-        self, system: LoopSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: LoopState, error: object
+        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: State, error: object
     ) -> PyTree:
         """Return nothing: the log has the decisions."""
         del system, carry, h, dynamics, state, error
         return ()
 
     def decide(
-        self, system: LoopSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
+        self, system: ObservedSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
     ) -> Decision:
         """Return the logged decision on the `attempt`, with the mode that was logged."""
         entry, no = self.entry, jnp.asarray(False)
@@ -176,7 +176,9 @@ class ReplayStepping:
         mode = mode_in_step(system, entry.next_words, no)
         return Decision(active, active, no, entry.lands >= 0, triggered, mode, entry.over)
 
-    def plan_next(self, system: LoopSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry) -> Carry:
+    def plan_next(
+        self, system: ObservedSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
+    ) -> Carry:
         """Return the carry `after` an `attempt` with the new delay behind the log."""
         delay, last = carry.control
         delay = jnp.where(decision.accepted & ~self.entry.refresh, attempt.shift, delay)
@@ -215,35 +217,35 @@ class LaggedReplayStepping:
 
     live: AdaptiveStepping
 
-    def start(self, loop: Loop, objectives: Objectives, key: Key) -> LaggedReplay:
-        """Return the carry of a run at t = 0, from `loop`, `objectives` and random `key`."""
-        ahead = self.live.start(_stop_gradients(loop), _stop_gradients(objectives), key)
-        return LaggedReplay(ahead, ReplayStepping(self.live).start(loop, objectives, key))
+    def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> LaggedReplay:
+        """Return the carry of a run at t = 0, from `hybrid`, `objectives` and random `key`."""
+        ahead = self.live.start(_stop_gradients(hybrid), _stop_gradients(objectives), key)
+        return LaggedReplay(ahead, ReplayStepping(self.live).start(hybrid, objectives, key))
 
-    def step(self, loop: Loop, objectives: Objectives, key: Key, carry: LaggedReplay) -> LaggedReplay:
+    def step(self, hybrid: HybridSystem, objectives: Objectives, key: Key, carry: LaggedReplay) -> LaggedReplay:
         """Return the `carry` after one attempt of the run for values, and its replay if the attempt was accepted."""
         # The run ahead only chooses the steps. All derivatives pass through the replay.
         old = _stop_gradients(carry.ahead)
-        new = _stop_gradients(self.live.step(_stop_gradients(loop), _stop_gradients(objectives), key, old))
+        new = _stop_gradients(self.live.step(_stop_gradients(hybrid), _stop_gradients(objectives), key, old))
         entry, replay = log_attempt(old, new), ReplayStepping(self.live)
 
         def repeat() -> Carry:
-            return replay.step(loop, objectives, key, carry.behind, entry)
+            return replay.step(hybrid, objectives, key, carry.behind, entry)
 
         return LaggedReplay(new, jax.lax.cond(any_lane(entry.accepted), repeat, lambda: carry.behind))
 
-    def renew(self, loop: Loop, carry: LaggedReplay) -> LaggedReplay:
-        """Return the `carry` with a new stability limit of the `loop` if the last one is too old."""
+    def renew(self, hybrid: HybridSystem, carry: LaggedReplay) -> LaggedReplay:
+        """Return the `carry` with a new stability limit of the `hybrid` if the last one is too old."""
         return carry._replace(
-            ahead=_stop_gradients(self.live.renew(_stop_gradients(loop), _stop_gradients(carry.ahead)))
+            ahead=_stop_gradients(self.live.renew(_stop_gradients(hybrid), _stop_gradients(carry.ahead)))
         )
 
 
-def log_capacity(loop: Loop, solver: Adaptive) -> int:
+def log_capacity(hybrid: HybridSystem, solver: Adaptive) -> int:
     """Return the capacity of the log of a run, in attempts."""
     rtol = float(clip_rtol(np.asarray(solver.rtol, float)))
     return math.ceil(BASE_LOG_CAPACITY * max(1.0, 1e-5 / rtol) ** (1 / ADAPTIVE_ERROR_ORDER)) + (
-        LOG_CAPACITY_PER_TICK * solver.steps if loop.ticks else 0
+        LOG_CAPACITY_PER_TICK * solver.steps if hybrid.ticks else 0
     )
 
 
@@ -269,7 +271,7 @@ def log_attempt(old: Carry, new: Carry) -> StepLog:
     )
 
 
-def states_between(spans: StateSpan, accepted: Bool, instants: Array) -> LoopState:
+def states_between(spans: StateSpan, accepted: Bool, instants: Array) -> State:
     """Return the states at the times `instants` (n,) [s], leaves (n, ...), from the steps of a replayed run.
 
     The spans have leaves (blocks, attempts, ...). That of an attempt that was not `accepted` (blocks, attempts) is that
@@ -314,3 +316,19 @@ def _time_to_zero(on: Bool, margin: Scalar, fall: Scalar, longest: Scalar) -> tu
 
 def _stop_gradients(tree: object) -> PyTree:
     return jax.tree.map(jax.lax.stop_gradient, tree)
+
+
+def refuse_derivative(hybrid: HybridSystem, objectives: Objectives, method: object) -> None:
+    """Raise a ValueError if an objective of a run would have a wrong derivative.
+
+    It is that of an objective that `counts_kinks`, behind a pure delay with adaptive steps.
+    """
+    if isinstance(method, AdaptiveStepping) and hybrid.recorders:
+        # Rounding moves the kinks of the delayed command between the logged run and its replay.
+        counting = {name: part for name, part in objectives.items() if getattr(part, "counts_kinks", False)}
+        if counting:
+            kinds_of_parts = ", ".join(sorted({type(part).__name__ for part in counting.values()}))
+            raise ValueError(
+                f"{', '.join(counting)}: {kinds_of_parts} has no derivative behind a pure delay with adaptive steps."
+                " Leave it out, or use d.FixedStep"
+            )

@@ -16,15 +16,27 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.types import Array, Bool, Int, Scalar
+from diffabs.core import shapes
+from diffabs.core.types import AnyArray, Array, Bool, Int, Scalar
 from diffabs.engine.step.event_location import EventSearch
 from diffabs.engine.step.modes import ModeBits, single_bit
-from diffabs.engine.types import Slide
 
 # A return within the shortest time that a search resolves counts `RETURN_AT_ONCE`, a later one 1.
 MAX_RETURNS, RETURN_AT_ONCE = 3, 2
 # Fraction of the fall: a margin at the beginning of a step that is farther from a line through zero is rounding.
 MAX_LINE_ERROR = 0.5
+
+
+class Slide(NamedTuple):
+    """The first slide of a run.
+
+    Attributes:
+        comparison: Number of the comparison along whose surface the run slides; -1 without a slide.
+        t: Time at which it begins [s]; NaN without a slide.
+    """
+
+    comparison: shapes.Int[AnyArray, "*runs"]
+    t: Scalar
 
 
 class SlideWatch(NamedTuple):

@@ -6,8 +6,8 @@ from functools import reduce
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.loop import Loop
 from diffabs.core.types import Array, PyTree, Scalar
+from diffabs.engine.hybrid import HybridSystem
 
 # A landing on the stop may leave at most this fraction of the margin's change in the step.
 MAX_MISSED_FRACTION = 0.1
@@ -48,7 +48,7 @@ def end_unfinished(carry: PyTree) -> PyTree:
     return carry._replace(status=status.astype(carry.status.dtype))
 
 
-def status_after_step(loop: Loop, carry: PyTree, attempt: PyTree, decision: PyTree) -> Scalar:
+def status_after_step(hybrid: HybridSystem, carry: PyTree, attempt: PyTree, decision: PyTree) -> Scalar:
     """Return the status after an accepted attempt.
 
     A landing whose margin is too far from zero (`MAX_MISSED_FRACTION`) misses the stop.
@@ -61,7 +61,7 @@ def status_after_step(loop: Loop, carry: PyTree, attempt: PyTree, decision: PyTr
     ]
     landed = jnp.where(reduce(jnp.logical_or, misses), RunStatus.MISSED, RunStatus.STOPPED)
     further = jnp.asarray(RunStatus.RUNNING)
-    if not loop.ticks:
+    if not hybrid.ticks:
         changed = jnp.any(jnp.stack([decision.crosses_surface, *jax.tree.leaves(decision.triggered)]))
         further = jnp.where(changed, RunStatus.REFRESHING, RunStatus.RUNNING)
     return jnp.where(reduce(jnp.logical_or, stops), landed, jnp.where(decision.over, RunStatus.TIMED_OUT, further))

@@ -1,4 +1,4 @@
-"""The dynamics of the loop and its objectives, as one function of time and state.
+"""The dynamics of a system and its objectives, as one function of time and state.
 
 Fixed steps evaluate the parts directly, unless switching surfaces are located. All other runs trace a program whose
 comparisons are visible (`comparisons`). Fixed steps on this program freeze a mode, and so do adaptive steps that are
@@ -10,14 +10,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.loop import Loop, LoopState, Margins, Signals
-from diffabs.core.protocols import Memory, Objective, Segment, Shown
+from diffabs.core.protocols import Memory, Segment
 from diffabs.core.types import PyTree, Scalar
+from diffabs.engine.hybrid import HybridSystem, Margins, Objectives, Signals, State
 from diffabs.engine.step.comparisons import SwitchedProgram
 from diffabs.engine.step.modes import ComparisonAnswers, Mode, ModeBits
 from diffabs.engine.step.surfaces import SwitchingFunction
 
-Objectives = dict[str, Objective]
 Accumulators = dict[str, Memory]
 
 UNCONSTRAINED = Mode(None)  # no frozen answers: every comparison is evaluated
@@ -25,14 +24,14 @@ MAX_CACHED_SYSTEMS = 256  # greatest number of traced programs that are kept
 _traced: dict[PyTree, tuple[SwitchedProgram | None, str]] = {}
 
 
-class LoopEvaluation(NamedTuple):
+class Instant(NamedTuple):
     """The dynamics at an instant.
 
     Attributes:
-        rate: Rates of the loop's flow.
+        rate: Rates of the system's flow.
         accumulator_rates: Rates of the objectives' integrals.
-        signals: Signals of the loop.
-        margins: Margins of the stop and of the blocks' events.
+        signals: Signals of the system.
+        margins: Margins of the stop and of the events.
     """
 
     rate: PyTree
@@ -45,14 +44,14 @@ class Evaluation(NamedTuple):
     """The dynamics at an instant within a mode, with the time derivatives that a step needs.
 
     Attributes:
-        rates: Rates of the loop's flow and of the objectives' integrals.
-        signals: Signals of the loop.
-        margins: Margins of the stop and of the blocks' events.
+        rates: Rates of the system's flow and of the objectives' integrals.
+        signals: Signals of the system.
+        margins: Margins of the stop and of the events.
         words: Answers to the comparisons.
         contradicted: Answers of the mode that the numbers contradict.
         surfaces: Margins of the comparisons.
-        signal_rates: Rates of the sample, or of plant outputs and setpoint, or (), as the objectives need them.
-        recorded_rates: Rates of the signals that blocks record, by block.
+        signal_rates: Rates of the sample, or of its shown part, or (), as the objectives need them.
+        recorded_rates: Rates of the recorded signals, by name.
         margin_rates: Rates of the margins of stop and events; () if they were not evaluated.
     """
 
@@ -67,19 +66,19 @@ class Evaluation(NamedTuple):
     margin_rates: PyTree
 
 
-class LoopSystem(NamedTuple):
-    """A loop and its objectives, with the program of their dynamics.
+class ObservedSystem(NamedTuple):
+    """A hybrid system and its objectives, with the program of their dynamics.
 
     Attributes:
         program: The program with visible comparisons; None if the parts are evaluated directly.
-        loop: Loop with the parameters of the run.
+        hybrid: The system, with the parameters of the run.
         objectives: Objectives by name.
-        signal_rates: Signals whose rates an evaluation has: "sample", "shown" (plant outputs and setpoint), or "".
+        signal_rates: Signals whose rates an evaluation has: "sample", "shown" (a part of them), or "".
         has_margin_rates: True if an evaluation has the rates of all margins.
     """
 
     program: SwitchedProgram | None
-    loop: Loop
+    hybrid: HybridSystem
     objectives: Objectives
     signal_rates: str
     has_margin_rates: bool
@@ -96,37 +95,37 @@ class LoopSystem(NamedTuple):
 
     def rates(self, t: Scalar, z: PyTree, held: PyTree, mode: Mode) -> PyTree:
         """Return dz/dt at time `t` within a `mode`, with z and `held` as `split_flow_and_held` returns them."""
-        moving, fixed = (t, *z), (held, self.loop, self.objectives)
+        moving, fixed = (t, *z), (held, self.hybrid, self.objectives)
         if self.program is None:
             return _evaluate_rates(moving, fixed)
         return self.program(lambda dynamics: dynamics[:2], moving, fixed, mode)
 
-    def list_margins(self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode) -> list[Scalar]:
+    def list_margins(self, t: Scalar, state: State, accumulators: Accumulators, mode: Mode) -> list[Scalar]:
         """Return the margins of comparisons and then of events at time `t`, `state` and `accumulators` in a `mode`."""
         z, held = split_flow_and_held(state, accumulators)
-        moving, fixed = (t, *z), (held, self.loop, self.objectives)
+        moving, fixed = (t, *z), (held, self.hybrid, self.objectives)
         if self.program is None:
-            return jax.tree.leaves(_evaluate_loop(moving, fixed).margins)
+            return jax.tree.leaves(_evaluate(moving, fixed).margins)
         # The rates are asked for, because they depend on all comparisons.
         (margins, _), answers = self.program.look(
             lambda dynamics: (dynamics.margins, dynamics[:2]), moving, fixed, mode
         )
         return [margin for _, margin in answers.margins] + jax.tree.leaves(margins)
 
-    def evaluate(self, t: Scalar, state: LoopState, accumulators: Accumulators, mode: Mode) -> Evaluation:
+    def evaluate(self, t: Scalar, state: State, accumulators: Accumulators, mode: Mode) -> Evaluation:
         """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`."""
         z, held = split_flow_and_held(state, accumulators)
-        fixed = (held, self.loop, self.objectives)
+        fixed = (held, self.hybrid, self.objectives)
 
-        def look(t: Scalar, z: PyTree) -> tuple[LoopEvaluation, ComparisonAnswers]:
+        def look(t: Scalar, z: PyTree) -> tuple[Instant, ComparisonAnswers]:
             if self.program is None:
-                return _evaluate_loop((t, *z), fixed), ComparisonAnswers((), (), [])
+                return _evaluate((t, *z), fixed), ComparisonAnswers((), (), [])
             return self.program.look(lambda dynamics: dynamics, (t, *z), fixed, mode)
 
         def moving_signals(t: Scalar, z: object) -> tuple[PyTree, ComparisonAnswers]:
             dynamics, answers = look(t, z)
             sample = dynamics.signals.sample
-            shown = {"sample": sample, "shown": Shown.of(sample), "": ()}[self.signal_rates]
+            shown = {"sample": sample, "shown": sample.shown(), "": ()}[self.signal_rates]
             margins = (
                 (dynamics.margins, [margin for _, margin in answers.margins]) if self.has_margin_rates else ((), [])
             )
@@ -135,7 +134,7 @@ class LoopSystem(NamedTuple):
         dynamics, answers = look(t, z)
         surfaces = [SwitchingFunction(*margin_pair) for margin_pair in answers.margins]
         signal_rates, recorded_rates, margin_rates = (), dynamics.signals.recorded, ()
-        if self.signal_rates or self.has_margin_rates or self.loop.recorders:
+        if self.signal_rates or self.has_margin_rates or self.hybrid.recorders:
             # The derivative along (1, dz/dt) is the total time derivative on the trajectory.
             along = (jnp.ones_like(t), dynamics[:2])
             (_, _, _, values), moves, answers = jax.jvp(moving_signals, (t, z), along, has_aux=True)
@@ -150,22 +149,22 @@ class LoopSystem(NamedTuple):
 
 
 def build_system(
-    loop: Loop,
+    hybrid: HybridSystem,
     objectives: Objectives,
     t: Scalar,
-    state: LoopState,
+    state: State,
     accumulators: Accumulators,
     *,
     switched: bool,
     has_margin_rates: bool = False,
-) -> LoopSystem:
-    """Return the system of a loop. Its program is traced once for each structure and for arguments of these shapes.
+) -> ObservedSystem:
+    """Return a system with its objectives. Its program is traced once for each structure and for these shapes.
 
     Of time, state and accumulators only shapes and types matter. A `switched` program has visible comparisons; without
     it the parts are evaluated directly.
     """
     z, held = split_flow_and_held(state, accumulators)
-    args = ((t, *z), (held, loop, objectives))
+    args = ((t, *z), (held, hybrid, objectives))
     leaves, tree = jax.tree.flatten(args)
     # `result_type(float)` is part of the key: with another precision the same shapes give another program.
     key = (tree, tuple(map(jax.typeof, leaves)), jnp.result_type(float), switched)
@@ -174,70 +173,70 @@ def build_system(
         while len(_traced) >= MAX_CACHED_SYSTEMS:
             _traced.pop(next(iter(_traced)), None)  # a dict keeps the order of insertion: the oldest goes first
         program = trace_program(*args) if switched else None
-        traced = _traced[key] = program, _find_asked_rates(loop, objectives, t, state, accumulators, smooth=switched)
-    return LoopSystem(traced[0], loop, objectives, traced[1], has_margin_rates)
+        traced = _traced[key] = program, _find_asked_rates(hybrid, objectives, t, state, accumulators, smooth=switched)
+    return ObservedSystem(traced[0], hybrid, objectives, traced[1], has_margin_rates)
 
 
 def trace_program(moving: PyTree, fixed: PyTree) -> SwitchedProgram:
-    """Return the program of the dynamics with visible comparisons, for the arguments of `_evaluate_loop`."""
+    """Return the program of the dynamics with visible comparisons, for the arguments of `_evaluate`."""
     # `counts`: only comparisons that influence rates or recorded signals produce a kink in the run.
-    return SwitchedProgram(
-        _evaluate_loop, moving, fixed, counts=lambda dynamics: (dynamics[:2], dynamics.signals.recorded)
-    )
+    return SwitchedProgram(_evaluate, moving, fixed, counts=lambda dynamics: (dynamics[:2], dynamics.signals.recorded))
 
 
 def _find_asked_rates(
-    loop: Loop, objectives: Objectives, t: Scalar, state: LoopState, accumulators: Accumulators, *, smooth: bool
+    hybrid: HybridSystem, objectives: Objectives, t: Scalar, state: State, accumulators: Accumulators, *, smooth: bool
 ) -> str:
-    """Return the signals of a segment whose rates the objectives ask for, as `LoopSystem.signal_rates`."""
+    """Return the signals of a segment whose rates the objectives ask for, as `ObservedSystem.signal_rates`."""
     needed = set()
 
     def note(kind: str, rates: object) -> tuple[PyTree, PyTree]:
         needed.add(kind)
         return rates, rates
 
-    def update(loop: Loop, objectives: Objectives, state: LoopState, accumulators: Accumulators, t: Scalar) -> PyTree:
-        sample = loop.signals(t, state).sample
+    def update(
+        hybrid: HybridSystem, objectives: Objectives, state: State, accumulators: Accumulators, t: Scalar
+    ) -> PyTree:
+        sample = hybrid.signals(t, state).sample
         segment = Segment(
             *(sample, sample, t, t),
-            lambda: note("shown", Shown.of(sample)),
+            lambda: note("shown", sample.shown()),
             lambda: note("sample", sample),
             smooth=t > 0 if smooth else False,
         )
         return {name: objective.update(accumulators[name], segment) for name, objective in objectives.items()}
 
-    jax.eval_shape(update, loop, objectives, state, accumulators, t)
+    jax.eval_shape(update, hybrid, objectives, state, accumulators, t)
     return "sample" if "sample" in needed else "shown" if needed else ""
 
 
-def split_flow_and_held(state: LoopState, accumulators: Accumulators) -> tuple[PyTree, PyTree]:
-    """Return the integrated part of loop and objectives, and the part that is constant between two instants."""
+def split_flow_and_held(state: State, accumulators: Accumulators) -> tuple[PyTree, PyTree]:
+    """Return the integrated part of system and objectives, and the part that is constant between two instants."""
     flow = (state.flow(), {name: memory.flow for name, memory in accumulators.items()})
-    return flow, ([memory.held for memory in state[1:]], {name: memory.held for name, memory in accumulators.items()})
+    return flow, (state.held(), {name: memory.held for name, memory in accumulators.items()})
 
 
-def with_flow(state: LoopState, accumulators: Accumulators, flow: PyTree) -> tuple[LoopState, Accumulators]:
+def with_flow(state: State, accumulators: Accumulators, flow: PyTree) -> tuple[State, Accumulators]:
     """Return state and accumulators with another integrated part, as `split_flow_and_held` returns it."""
     return state.with_flow(flow[0]), {
         name: memory._replace(flow=flow[1][name]) for name, memory in accumulators.items()
     }
 
 
-def _evaluate_loop(moving: PyTree, fixed: PyTree) -> LoopEvaluation:
-    """Return the dynamics for (time, flow, accumulator flow) and ((held, accumulator held), loop, objectives)."""
-    (t, flow, tally_flow), ((held, tally_held), loop, objectives) = moving, fixed
-    state = LoopState(flow[0], *(Memory(*both) for both in zip(flow[1:], held, strict=True)))
+def _evaluate(moving: PyTree, fixed: PyTree) -> Instant:
+    """Return the dynamics for (time, flow, accumulator flow) and ((held, accumulator held), system, objectives)."""
+    (t, flow, tally_flow), ((held, tally_held), hybrid, objectives) = moving, fixed
+    state = hybrid.join_state(flow, held)
     accumulators = {name: Memory(tally_flow[name], tally_held[name]) for name in tally_flow}
-    signals = loop.signals(t, state)
-    rate = loop.flow(t, state, signals)
-    margins = loop.margins(t, state, signals, lambda: rate)
+    signals = hybrid.signals(t, state)
+    rate = hybrid.flow(t, state, signals)
+    margins = hybrid.margins(t, state, signals, lambda: rate)
     accumulator_rates = {
         name: objective.flow(accumulators[name], signals.sample) for name, objective in objectives.items()
     }
-    return LoopEvaluation(rate, accumulator_rates, signals, margins)
+    return Instant(rate, accumulator_rates, signals, margins)
 
 
 @jax.jit  # traced and differentiated once for all stages of a step
 def _evaluate_rates(moving: object, fixed: object) -> PyTree:
-    """Return the rates of `_evaluate_loop`."""
-    return _evaluate_loop(moving, fixed)[:2]
+    """Return the rates of `_evaluate`."""
+    return _evaluate(moving, fixed)[:2]

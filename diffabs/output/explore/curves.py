@@ -8,14 +8,15 @@ import numpy as np
 
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import Part
-from diffabs.engine.admissible import batch_admissibility
-from diffabs.engine.convert import trajectory_columns
-from diffabs.engine.faults import describe_faults
-from diffabs.engine.run import rollout
-from diffabs.engine.types import Adaptive, FixedStep, Run, Solver
+from diffabs.engine.solvers import Adaptive, FixedStep, Solver
 from diffabs.linear.robustness import low_discrepancy_points
+from diffabs.loop.admissible import batch_admissibility
 from diffabs.loop.batch import Batch
+from diffabs.loop.convert import trajectory_columns
 from diffabs.loop.ensemble import run_batch
+from diffabs.loop.faults import describe_faults
+from diffabs.loop.result import Run
+from diffabs.loop.run import rollout
 from diffabs.output.explore.friction import FACTOR_PATH
 from diffabs.output.explore.knobs import is_vehicle, mass_path
 from diffabs.output.explore.panels import Curve, Curves, Fan, Panel, Spread

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import get, parameters, replace
 from diffabs.core.types import JsonObject
+from diffabs.loop.closed_loop import Loop
 from diffabs.output.explore import friction
 from diffabs.output.explore.knobs import unit_words
 from diffabs.output.explore.session import CERTIFIED, NOT_PROVED, ProofVerdict, Session

@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, get, parameters, replace
 from diffabs.core.types import PyTree
 from diffabs.core.validity import find_problems
-from diffabs.engine.admissible import find_mismatches, find_unstable_step
 from diffabs.host.separated import read_decimal
 from diffabs.host.values import ScenarioError, read_number_in_range, unknown_name_error, wrong_kind_error
+from diffabs.loop.admissible import find_mismatches, find_unstable_step
+from diffabs.loop.closed_loop import Loop
 from diffabs.output.explore import friction, knobs, tuning
 from diffabs.output.explore.knobs import Knob
 from diffabs.output.explore.panels import Spread

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.blocks import offers
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import ParameterSpec, arrays, parameters, prepare_parts
 from diffabs.core.tracing import depends_on_signal, leaf_dependence
@@ -26,6 +25,7 @@ from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import unit_at
 from diffabs.core.validity import find_problems
 from diffabs.engine.step.runge_kutta import rk4_step
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.controllers import Sampled, SampledOnGrid
 from diffabs.parts.controllers.sampled import replace_nan
 

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.types import AnyArray, JsonObject, Scalar
 from diffabs.linear.opened_loop import linear_controller
+from diffabs.loop.closed_loop import Loop
 from diffabs.output.export.device import NotExported, check_numbers, with_sampled_controller
 
 ENTRY_ROUNDING = 1e-12  # relative to a matrix's largest coefficient; smaller coefficients are rounding errors

@@ -18,9 +18,9 @@ from xml.etree import ElementTree as xml
 
 from diffabs.compiler.emit.c99_words import Words, is_name
 from diffabs.compiler.runtime.toolchain import NoCompiler, find_compiler
-from diffabs.core.loop import Loop
 from diffabs.host import files
 from diffabs.host.values import make_printable
+from diffabs.loop.closed_loop import Loop
 from diffabs.output.export.device import NotExported
 from diffabs.output.export.plant_c import FmuVariable, PlantSource, plant_source
 

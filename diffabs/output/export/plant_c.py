@@ -16,11 +16,11 @@ from diffabs.compiler.emit.c99_words import Words
 from diffabs.compiler.ir import Node, UpdateLevel, is_real, live_nodes
 from diffabs.compiler.lower.labels import Labelled
 from diffabs.compiler.lower.rules import Unsupported
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import ParameterSpec, canonical_dtypes, parameters, prepare_parts
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import unit_at
 from diffabs.engine.step.runge_kutta import rk4_step
+from diffabs.loop.closed_loop import Loop
 from diffabs.output.export.device import NotExported, check_numbers
 from diffabs.output.export.lowered import fill_shapes, number_leaves, trace_outputs
 

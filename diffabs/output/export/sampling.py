@@ -2,9 +2,9 @@
 
 import dataclasses
 
-from diffabs.core.loop import Loop
 from diffabs.core.units import units_of
 from diffabs.core.validity import find_problems
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.controllers import Sampled, SampledOnGrid
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from diffabs.core.protocols import Road
 from diffabs.core.types import Table
-from diffabs.engine.types import Run, Trajectory
+from diffabs.loop.result import Run, Trajectory
 from diffabs.output.plot.style import (
     COLOURS,
     GREY,

@@ -19,10 +19,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.loop import Loop
+from diffabs.core.protocols import Sample
 from diffabs.core.types import AnyArray, Array, Bool, Params, PyTree, Scalar
-from diffabs.engine.types import Solver
+from diffabs.engine.solvers import Solver
 from diffabs.loop.batch import Batch
+from diffabs.loop.closed_loop import Loop
 from diffabs.loop.ensemble import run_batch
 from diffabs.parts.controllers.balance import state_of
 from diffabs.robust.design.capture import capture_ellipsoids
@@ -117,10 +118,10 @@ class _Ellipsoids(NamedTuple):
         system = self.system[jnp.minimum(number, len(self.system) - 1)]
         return self.roots[system], self.hopeless[system]
 
-    def has_reached(self, data: PyTree, output: PyTree) -> Bool:
+    def has_reached(self, data: PyTree, sample: Sample) -> Bool:
         """Return whether a run is inside its ellipsoid, with a margin, or unstable."""
         root, hopeless = data
-        return (jnp.sum((root @ state_of(output)) ** 2) <= CAPTURE_LEVEL) | hopeless
+        return (jnp.sum((root @ state_of(sample.output)) ** 2) <= CAPTURE_LEVEL) | hopeless
 
     def contain(self, x: np.ndarray) -> np.ndarray:
         """Return whether each state (runs, 6) is inside its ellipsoid; False for NaN."""

@@ -28,11 +28,11 @@ import jax
 import numpy as np
 
 from diffabs.core.blocks import Direct
-from diffabs.core.loop import Loop
 from diffabs.core.numerics import spectral_bound
 from diffabs.core.pytree import replace
 from diffabs.core.types import Params, Part, PyTree
 from diffabs.linear.balance_model import BalanceModel
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.actuators import VoltageLimit
 from diffabs.parts.controllers import BalanceFeedback
 from diffabs.parts.stops import Fallen

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import replace
 from diffabs.core.types import AnyArray, Array, Part, Scalar
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import SlipModel
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.controllers import ProportionalFeedback
 from diffabs.parts.controllers.sampled import inner_controller
 from diffabs.parts.plants import BrakeStart

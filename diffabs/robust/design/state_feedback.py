@@ -19,13 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.blocks import Direct, Series
-from diffabs.core.loop import Loop
 from diffabs.core.types import AnyArray, Part, PyTree
 from diffabs.core.units import insert_unit, units_of
 from diffabs.core.validity import check_part
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.operating_point import OperatingPoint, loop_gain, operating_point
 from diffabs.linear.slip_model import Continuous, LowPass, Sampling, SlipModel
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.actuators import Delay, Lag, Limits, RateLimit, VoltageLimit
 from diffabs.parts.controllers import (
     PID,

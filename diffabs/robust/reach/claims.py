@@ -3,9 +3,9 @@
 import math
 from collections.abc import Sequence
 
-from diffabs.core.loop import Loop
 from diffabs.host.separated import read_decimal
 from diffabs.host.values import ScenarioError, unknown_name_error
+from diffabs.loop.closed_loop import Loop
 from diffabs.robust.reach.cover import RunClaim
 from diffabs.robust.reach.equations import Equations
 

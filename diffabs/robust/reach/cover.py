@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.loop import Loop
 from diffabs.core.renamed import refuse_old_names
 from diffabs.core.types import PyTree
+from diffabs.loop.closed_loop import Loop
 from diffabs.robust.reach.engine import FAILURES, CellBounds, Prover
 from diffabs.robust.reach.equations import LARGEST_INPUT, Equations, derive_equations
 from diffabs.robust.reach.search_tail import find_tail

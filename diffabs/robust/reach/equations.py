@@ -30,12 +30,12 @@ from jax.typing import DTypeLike
 from diffabs.compiler.ir import Graph, Node, NodeArray, UpdateLevel, live_nodes
 from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxpr, scalar_array
 from diffabs.core.blocks import offers
-from diffabs.core.loop import BLOCKS, Loop, LoopState
 from diffabs.core.messages import Clock
 from diffabs.core.protocols import BrakeOutput
 from diffabs.core.pytree import parameters, replace
 from diffabs.core.types import Int, PyTree, Scalar
 from diffabs.core.validity import check_part
+from diffabs.loop.closed_loop import BLOCKS, Loop, LoopState
 from diffabs.parts.controllers.sampled import Sampled
 from diffabs.parts.plants import BrakeStart
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import BrakeOutput
-from diffabs.engine.types import Solver
+from diffabs.engine.solvers import Solver
 from diffabs.loop.batch import Batch
+from diffabs.loop.closed_loop import Loop
 from diffabs.loop.ensemble import run_batch
 from diffabs.parts.objectives import MaxSlip, StopDistance, StopTime
 from diffabs.parts.stops import SpeedReached

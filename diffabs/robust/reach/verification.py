@@ -13,10 +13,10 @@ from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
-from diffabs.core.loop import Loop
 from diffabs.core.renamed import refuse_old_names
 from diffabs.core.types import JsonObject
 from diffabs.host.values import format_given
+from diffabs.loop.closed_loop import Loop
 from diffabs.robust.reach.certificate import FORMAT, proved_ends
 from diffabs.robust.reach.cover import RunClaim, check_box, comes_from_halving, name_contradiction
 from diffabs.robust.reach.equations import Equations, RealOperation, derive_equations

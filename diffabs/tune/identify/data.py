@@ -6,9 +6,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from diffabs.core.kinds import format_value
-from diffabs.core.loop import Loop
 from diffabs.core.types import PyTree, Scalar
-from diffabs.engine.types import Solver
+from diffabs.engine.solvers import Solver
+from diffabs.loop.closed_loop import Loop
 from diffabs.tune.identify.residuals import Residuals
 
 

@@ -14,13 +14,13 @@ import jax
 
 from diffabs.core.bijectors import Range
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.types import Table
 from diffabs.core.validity import check_part
-from diffabs.engine.admissible import batch_admissibility
-from diffabs.engine.stability import stable_steps
-from diffabs.engine.types import Solver
+from diffabs.engine.solvers import Solver
+from diffabs.loop.admissible import batch_admissibility
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.stability import stable_steps
 from diffabs.tune.identify.data import Comparison, Data
 from diffabs.tune.identify.fit import Identified, Tolerances, fit
 from diffabs.tune.identify.residuals import Prior

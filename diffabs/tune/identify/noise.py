@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from diffabs.core.bijectors import Range
-from diffabs.core.loop import Loop
 from diffabs.core.types import JsonObject, Table
-from diffabs.engine.types import Solver
+from diffabs.engine.solvers import Solver
+from diffabs.loop.closed_loop import Loop
 from diffabs.tune.identify.fit import Identified
 from diffabs.tune.identify.identification import identify
 from diffabs.tune.identify.traces import Traces

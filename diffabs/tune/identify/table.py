@@ -8,14 +8,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, get, parameters, replace
 from diffabs.core.types import Part, PyTree, Scalar, Vector
 from diffabs.core.validity import check_part
-from diffabs.engine.run import measure
-from diffabs.engine.types import Solver
+from diffabs.engine.solvers import Solver
 from diffabs.loop.batch import Batch, group_by_structure, stack_loops
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.run import measure
 from diffabs.parts.objectives import BRAKING
 from diffabs.tune.identify.data import Comparison, check_positive, check_sigma_table
 

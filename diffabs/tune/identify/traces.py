@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.loop import Loop
 from diffabs.core.numerics import clamp, ratio
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.types import Matrix, Params, Part, Scalar, Table, Vector
-from diffabs.engine.run import rollout
-from diffabs.engine.types import FixedStep, Solver
+from diffabs.engine.solvers import FixedStep, Solver
 from diffabs.loop.batch import Batch
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.run import rollout
 from diffabs.tune.identify.data import Comparison, check_positive, check_sigma_table
 from diffabs.tune.identify.fit import Identified
 

@@ -24,11 +24,11 @@ import numpy as np
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import JsonObject, Params, PyTree, Scalar, Table
 from diffabs.core.units import resolve_unit, units_of
-from diffabs.engine.admissible import batch_admissibility
 from diffabs.engine.drive.engine import describe_engine, log_kernel, log_xla_reason, resolve_request
 from diffabs.engine.drive.sharding import describe_placement
+from diffabs.loop.admissible import batch_admissibility
 from diffabs.loop.batch import Batch
-from diffabs.loop.ensemble import run_batch
+from diffabs.loop.ensemble import kernel_objection, run_batch
 from diffabs.uncertainty.reliability.importance_sampling import DESIGN_POINT_STARTS, Gradient
 from diffabs.uncertainty.reliability.subset_simulation import (
     RareEvent,
@@ -175,11 +175,9 @@ def choose_metric_engine(study: Study, metric: str) -> tuple[Study, str]:
 
 def find_metric_objection(study: Study, metric: str) -> str | None:
     """Return why a kernel cannot make the runs of a study that measures only this metric, or None; it makes no run."""
-    from diffabs.engine.drive import kernel as native
-
     values = study.space.normal(np.zeros((1, study.space.dimension)))
     with precision(study.dtype):
-        return native.kernel_objection(*_cast_arguments(study, metric, values))
+        return kernel_objection(*_cast_arguments(study, metric, values))
 
 
 def _cast_arguments(study: Study, metric: str, values: Params) -> PyTree:

@@ -10,9 +10,10 @@ import numpy as np
 
 from diffabs.core.pytree import refine_parts
 from diffabs.core.types import Bool, JsonObject, Key, Part
-from diffabs.engine.types import describe_solver, differs_in_kind, refine_solver
+from diffabs.engine.solvers import describe_solver, refine_solver
 from diffabs.loop.accuracy import is_comparable
 from diffabs.loop.batch import Batch, group_by_structure, stack_loops
+from diffabs.loop.result import differs_in_kind
 from diffabs.uncertainty.sweep.runner import Columns, Runner
 from diffabs.uncertainty.sweep.study import Study, is_accepted, precision
 

@@ -10,11 +10,11 @@ import jax
 
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.kinds import format_value
-from diffabs.core.loop import Loop
 from diffabs.core.types import Table
 from diffabs.engine.drive.engine import log_xla_reason
 from diffabs.host import provenance, stopwatch
 from diffabs.host.interactive import ProgressLine, report_to
+from diffabs.loop.closed_loop import Loop
 from diffabs.uncertainty.sweep.engines import Engine, Local
 from diffabs.uncertainty.sweep.manifest import Seals, describe_owner, read_notes
 from diffabs.uncertainty.sweep.results import Results

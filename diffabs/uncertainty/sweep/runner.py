@@ -24,10 +24,10 @@ from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Objective
 from diffabs.core.types import Bool, Int, JsonObject, Params, Part, PyTree
-from diffabs.engine.admissible import batch_admissibility
 from diffabs.engine.drive.engine import EngineError
-from diffabs.engine.types import Solver
+from diffabs.engine.solvers import Solver
 from diffabs.host.process import default_devices, default_platform
+from diffabs.loop.admissible import batch_admissibility
 from diffabs.loop.batch import Batch
 from diffabs.loop.ensemble import run_batch
 from diffabs.uncertainty.sweep.study import FLAG_COLUMNS, Study, noise_key, precision

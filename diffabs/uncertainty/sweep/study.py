@@ -14,16 +14,16 @@ import jax
 import numpy as np
 
 from diffabs.compiler import pipeline
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get, parameters, replace
 from diffabs.core.types import Bool, Int, JsonObject, Params, Table
 from diffabs.core.units import resolve_unit, unit_at, units_of
 from diffabs.core.validity import find_problems
-from diffabs.engine.admissible import find_solver_faults, first_refusal
 from diffabs.engine.drive.engine import REQUESTABLE_ENGINES
-from diffabs.engine.types import Solver, describe_solver
+from diffabs.engine.solvers import Solver, describe_solver, find_solver_faults
 from diffabs.host.values import ScenarioError, as_plain, plain_fields, read_whole, unknown_name_error
+from diffabs.loop.admissible import first_refusal
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.objectives import default_objectives
 from diffabs.uncertainty.sweep.discrete import Categorical
 from diffabs.uncertainty.sweep.variables import Space

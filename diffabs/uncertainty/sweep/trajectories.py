@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import zarr
 
-from diffabs.engine.convert import signal_columns
-from diffabs.engine.run import run_unchecked
-from diffabs.engine.types import Trajectory
 from diffabs.host import files
+from diffabs.loop.convert import signal_columns
+from diffabs.loop.result import Trajectory
+from diffabs.loop.run import run_unchecked
 from diffabs.uncertainty.sweep.study import Study, precision
 
 TRAJECTORIES_NAME = "trajectories.zarr"

@@ -8,12 +8,12 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from diffabs.core.loop import LOOP_SIGNALS
 from diffabs.core.optional import import_optional
 from diffabs.core.protocols import Plant, Sample
 from diffabs.core.summary import Summary, round_for_table
 from diffabs.core.types import Params, PyTree
-from diffabs.engine.faults import describe_faults
+from diffabs.loop.closed_loop import LOOP_SIGNALS
+from diffabs.loop.faults import describe_faults
 
 NUMBER_TYPES = (jax.Array, np.ndarray, np.generic, float, int, bool)
 DEFAULT_CONTROL_UNIT = "control"  # unit of the control if no plant is given

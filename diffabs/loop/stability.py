@@ -21,11 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Memory, Reference
 from diffabs.core.pytree import canonical_dtypes, part, pytree, replace
 from diffabs.core.tracing import split_batched
 from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.loop.closed_loop import Loop
 
 BOUND_SQUARINGS = 4  # k = 16: within 3 % of the spectral radius for the loops of the papers
 LANES_PER_CHUNK = 256  # runs whose matrices stay in a processor's cache

@@ -5,29 +5,19 @@ import logging
 from collections.abc import Mapping
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-from jax.typing import DTypeLike
 
 from diffabs.core import kinds
-from diffabs.core.arrays import as_array
 from diffabs.core.compiling import is_traced
 from diffabs.core.first_order import without_derivative
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, parameters, replace, stack_lists
 from diffabs.core.types import Params, PyTree
 from diffabs.core.validity import find_broken, find_misshapen, part_rules
-from diffabs.engine.admissible import (
-    find_impossible_values,
-    find_solver_faults,
-    find_unstable_step,
-    was_step_checked,
-)
-from diffabs.engine.contracts import refuse_misfits
-from diffabs.engine.step.adaptive import AdaptiveStepping, clip_rtol
-from diffabs.engine.step.fixed import FixedStepping
-from diffabs.engine.types import Adaptive, Solver
+from diffabs.engine.drive.runs import build_stepping
+from diffabs.engine.solvers import Solver, find_solver_faults
+from diffabs.loop.admissible import find_impossible_values, find_unstable_step, was_step_checked
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.contracts import refuse_misfits
 
 log = logging.getLogger("diffabs")
 OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an objective
@@ -47,16 +37,6 @@ def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objec
         # Only traced values can be differentiated.
         loop = replace(loop, forbid_derivatives(loop, {path: value for path, _, value in parameters(loop)}))
     return loop, objectives, build_stepping(solver, jax.tree.leaves(loop)[0].dtype)
-
-
-def build_stepping(solver: Solver, dtype: DTypeLike) -> FixedStepping | AdaptiveStepping:
-    """Return the stepping method of a solver, with numbers of one data type: a pytree, for compiled programs."""
-    number = jnp.asarray if is_traced() else as_array
-    # `device_put` instead of `jnp.asarray`, which would compile a program.
-    h, steps = number(float(solver.step), dtype), jax.device_put(solver.steps)
-    if isinstance(solver, Adaptive):
-        return AdaptiveStepping(h, steps, number(float(clip_rtol(np.asarray(solver.rtol, dtype))), dtype))
-    return FixedStepping(h, steps, solver.kinks)
 
 
 def forbid_derivatives(loop: Loop, values: Params) -> dict[str, PyTree]:
@@ -122,19 +102,3 @@ _warn_unchecked_step = functools.cache(
         "solver.step = %s s is not checked for stability, because the loop is traced; d.check(loop, solver) checks it",
     )
 )
-
-
-def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: object) -> None:
-    """Raise a ValueError if an objective of a run would have a wrong derivative.
-
-    It is that of an objective that `counts_kinks`, behind a pure delay with adaptive steps.
-    """
-    if isinstance(method, AdaptiveStepping) and loop.recorders:
-        # Rounding moves the kinks of the delayed command between the logged run and its replay.
-        counting = {name: part for name, part in objectives.items() if getattr(part, "counts_kinks", False)}
-        if counting:
-            kinds_of_parts = ", ".join(sorted({type(part).__name__ for part in counting.values()}))
-            raise ValueError(
-                f"{', '.join(counting)}: {kinds_of_parts} has no derivative behind a pure delay with adaptive steps."
-                " Leave it out, or use d.FixedStep"
-            )

@@ -1,23 +1,16 @@
-"""Solvers and results of a run."""
+"""Solvers: which steps a run takes."""
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
+from jax.core import Tracer
 
-from diffabs.core import shapes
-from diffabs.core.jax_flags import default_flags
+from diffabs.core import kinds
 from diffabs.core.meanings import document_fields
-from diffabs.core.protocols import Ending, Plant, Sample
-from diffabs.core.types import AnyArray, Bool, PyTree, Scalar
-from diffabs.engine import convert
+from diffabs.core.types import PyTree
 
-if TYPE_CHECKING:
-    import pandas
-    import xarray
+MAX_SOLVER_STEPS = 1e8
 
 
 @document_fields
@@ -158,117 +151,42 @@ def describe_solver(solver: Solver) -> dict[str, PyTree]:
     return fields if solver.kinks is None else fields | {"kinks": solver.kinks}
 
 
-def differs_in_kind(first: Scalar, second: Scalar) -> Bool:
-    """Return True where two values of a metric differ and are not both finite, such as 0.3 s and "never".
+def find_solver_faults(solver: Solver) -> list[str]:
+    """Return one line for each fault of a solver, independent of the loop; an empty list if there is none.
 
-    Such a change has no size: the difference would be infinite or NaN.
+    `kinks` must be True, False or None. Each other field must be a positive, finite number, `rtol` below 1. The step
+    must not be longer than the duration. At most `MAX_SOLVER_STEPS` steps are allowed.
     """
-    finite = np.isfinite(first) & np.isfinite(second)
-    return ~finite & (np.asarray(first) != second) & ~(np.isnan(first) & np.isnan(second))
+    if not isinstance(solver, FixedStep | Adaptive):
+        solvers = "d.FixedStep(step=..., duration=...) or d.Adaptive(rtol=..., duration=...)"
+        return [f"solver = {kinds.format_value(solver)} is no solver; {solvers} is needed"]
+    names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
+    if lines := [f"solver.{name} {line}" for name in names if (line := _find_field_fault(name, getattr(solver, name)))]:
+        return lines
+    kinks = getattr(solver, "kinks", None)
+    if not (kinks is None or isinstance(kinks, bool)):
+        return [f"solver.kinks = {kinks!r} is not a Python bool; True, False or None is needed"]
+    step, duration = solver.step, solver.duration
+    if step > duration:
+        return [
+            f"solver.step = {step:g} s is outside (0, {duration:g}] s: longer than solver.duration = {duration:g} s"
+        ]
+    if duration / step > MAX_SOLVER_STEPS:
+        shortest = duration / MAX_SOLVER_STEPS
+        return [f"solver.step = {step:g} s is outside [{shortest:g}, {duration:g}] s: too many steps"]
+    return []
 
 
-class Trajectory(NamedTuple):
-    """Signals of a run with a leading time axis (instants,). After the end of a run the last sample is repeated.
-
-    Attributes:
-        sample: Time, plant outputs, target, setpoint, feedforward, command and control.
-        measured: Output of the sensor.
-        state: State of the plant.
-        running: True before the end of the run, False from its end on; bool, shape (instants,).
-    """
-
-    sample: Sample
-    measured: PyTree
-    state: PyTree
-    running: shapes.Bool[AnyArray, "*runs instants"]
-
-    def finite(self) -> Scalar:
-        """Return True if every number of `sample` is finite; `measured` and `state` are not checked."""
-        return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(self.sample)]))
-
-
-class Slide(NamedTuple):
-    """The first slide of a run.
-
-    Attributes:
-        comparison: Number of the comparison along whose surface the run slides; -1 without a slide.
-        t: Time at which it begins [s]; NaN without a slide.
-    """
-
-    comparison: shapes.Int[AnyArray, "*runs"]
-    t: Scalar
-
-
-class Run(NamedTuple):
-    """The result of a run: metrics, end flags and, on request, a trajectory. At most one end flag is True.
-
-    In a batch every field has a leading axis (runs,). All flags are False if `EarlyEnd` ended the run.
-
-    Attributes:
-        metrics: Values of the objectives by name. All are NaN if the run diverged.
-        stopped: True if the run reached its stop within the duration.
-        diverged: True if a number is not finite or not physically possible, or if the start is beyond the stop. Also
-            True for a missed landing, for steps that are too many or cannot meet their tolerance, for a run that was
-            not accepted, and for a run with adaptive steps that slides.
-        timed_out: True if the duration ended before the stop. Metrics are valid then.
-        ending: Last sample, whether the run stopped, and the time and distance that remain.
-        trajectory: Signals at the kept instants; None if no trajectory was requested.
-        slide: First slide along a switching surface; None if it is not known. All derivatives of such a run are NaN.
-            The values of a run with fixed steps stay. Values alone do not always show a slide: see `slid`.
-        fault: Reason for `diverged` as a number (`simulate.faults.Fault`); None if it is not known. `repr` has words.
-    """
-
-    metrics: dict[str, shapes.Float[AnyArray, "*runs"]]
-    stopped: shapes.Bool[AnyArray, "*runs"]
-    diverged: shapes.Bool[AnyArray, "*runs"]
-    timed_out: shapes.Bool[AnyArray, "*runs"]
-    ending: Ending
-    trajectory: Trajectory | None
-    slide: Slide | None = None
-    fault: shapes.Int[AnyArray, "*runs"] | None = None
-
-    @property
-    @default_flags()
-    def slid(self) -> Bool:
-        """True if the run slides along a switching surface, because the flows of both sides push onto it.
-
-        A run with fixed steps for values notices it only if it ends steps on switching surfaces (`FixedStep.kinks`).
-        """
-        return False if self.slide is None else self.slide.comparison >= 0
-
-    def __getattr__(self, name: str) -> Any:
-        """Raise the AttributeError for a `name` that is no field, with the metrics of the run."""
-        line = f"a Run has no field {name}"
-        if not name.startswith("_") and isinstance(self.metrics, dict):
-            metrics = f"its metrics are {', '.join(self.metrics)}" if self.metrics else "it has no metrics"
-            line += f'; run.metrics["{name}"] is a metric' if name in self.metrics else f"; {metrics}"
-        raise AttributeError(line, name=name, obj=self)
-
-    def __repr__(self) -> str:
-        """Return how the run ended, and its metrics."""
-        return str(convert.summarise_run(self))
-
-    def _repr_html_(self) -> str:
-        """Return the summary for a notebook."""
-        return convert.summarise_run(self)._repr_html_()
-
-    def pandas(self, plant: Plant | None = None) -> "pandas.DataFrame":
-        """Return a pandas.DataFrame: the trajectory indexed by `t`, or without a trajectory one row per run.
-
-        See `to_pandas`. The `plant` defines the unit of the control. Trajectories of a batch raise a ValueError.
-        """
-        return convert.to_pandas(self, plant)
-
-    def xarray(self, plant: Plant | None = None) -> "xarray.Dataset":
-        """Return the trajectory as an xarray.Dataset over the time, each variable with `units`.
-
-        The `plant` defines the unit of the control. A run without a trajectory or a batch raises a ValueError.
-        """
-        return convert.to_xarray(self, plant)
-
-    def plot(self, plant: Plant | None = None, *, title: str = "") -> Any:
-        """Return the run as a matplotlib figure (extra `plot`) with this `title`.
-
-        The `plant` defines the unit of the control. A run without a trajectory raises a ValueError.
-        """
-        return convert.to_figure(self, plant, title)
+def _find_field_fault(name: str, value: Any) -> str:
+    """Return the fault in the value of one field of a solver, or an empty string."""
+    if isinstance(value, Tracer):
+        return "is traced; a number that is known before the trace is needed"
+    if line := kinds.find_value_objection(value) or (
+        kinds.value_shape(value) and f"has shape {kinds.value_shape(value)}"
+    ):
+        return f"= {kinds.format_value(value)} {line}; a number is needed"
+    if not 0 < value < math.inf:
+        return f"= {value} is not positive and finite"
+    if name == "rtol" and value >= 1:
+        return f"= {value} is outside (0, 1)"
+    return f"= {value} is no whole number" if name == "every" and value != int(value) else ""

@@ -19,10 +19,10 @@ import numpy as np
 
 from diffabs.core import kinds
 from diffabs.core.blocks import offers
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Ending, Memory, Objective, Sample, Tracking, resting_segment
 from diffabs.core.pytree import canonical_dtypes, stack_lists
 from diffabs.host.values import kebab_case
+from diffabs.loop.closed_loop import Loop
 
 STEP = 1e-3  # [s] arbitrary: only its type matters
 # folders whose code is not the user's: this package, Python's library, and installed packages such as JAX

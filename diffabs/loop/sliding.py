@@ -10,15 +10,15 @@ import numpy as np
 from jax._src.source_info_util import summarize  # JAX has no public function that names the line of an operation
 
 from diffabs.core import numerics
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Objective
 from diffabs.core.types import Source
-from diffabs.engine.arguments import prepare_arguments
-from diffabs.engine.result import prepare
+from diffabs.engine.solvers import Adaptive, Solver
 from diffabs.engine.step.attempt import start_state
 from diffabs.engine.step.comparisons import SwitchedProgram
 from diffabs.engine.step.system import split_flow_and_held, trace_program
-from diffabs.engine.types import Adaptive, Run, Solver
+from diffabs.loop.arguments import prepare_arguments
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.result import Run
 
 FRAMES_OF_A_COMPARISON = 6  # calls that are read to find the line that compares, from the innermost one on
 SLIDE_ADVICE = (
@@ -47,7 +47,7 @@ def describe_slide(loop: Loop, solver: Solver, objectives: Mapping[str, Objectiv
 def _trace_program(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> SwitchedProgram:
     # Not the program of the run: what JAX traces while it evaluates a primitive has the line of the primitive.
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
-    loop, audit = prepare(loop)
+    loop, audit = loop.prepare_run()
     measured, zero = dict(objectives) | audit, jnp.zeros_like(method.h)
     state, accumulators = start_state(loop, measured, Clock(zero, method.h, jnp.asarray(0), None))
     flow, held = split_flow_and_held(state, accumulators)

@@ -7,8 +7,8 @@ from typing import Any
 
 from diffabs.core.protocols import Plant
 from diffabs.core.types import PyTree
-from diffabs.engine.convert import trajectory_columns
-from diffabs.engine.types import Run
+from diffabs.loop.convert import trajectory_columns
+from diffabs.loop.result import Run
 
 KEYWORDS_TEXT = (
     "break case catch classdef continue else elseif end for function global if otherwise parfor persistent return spmd "

@@ -16,23 +16,20 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
-from diffabs.core import kinds
 from diffabs.core.arrays import as_array
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once, is_traced
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.loop import Loop
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.rules import Rule
 from diffabs.core.types import Params, Part, PyTree, Scalar
 from diffabs.core.validity import check_part as check_parts
 from diffabs.core.validity import find_broken, find_misshapen, grid_rules, part_rules
-from diffabs.engine.contracts import refuse_misfits
-from diffabs.engine.stability import is_step_stable, stable_step
-from diffabs.engine.types import Adaptive, FixedStep, Solver
+from diffabs.engine.solvers import Adaptive, Solver, find_solver_faults
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.contracts import refuse_misfits
+from diffabs.loop.stability import is_step_stable, stable_step
 
-MAX_SOLVER_STEPS = 1e8
 T = TypeVar("T")
 
 
@@ -106,47 +103,6 @@ def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
     """
     lines = list(find_broken([_start_rule(loop)]))
     yield from lines or find_solver_faults(solver) or find_broken(grid_rules(loop, solver.step))
-
-
-def find_solver_faults(solver: Solver) -> list[str]:
-    """Return one line for each fault of a solver, independent of the loop; an empty list if there is none.
-
-    `kinks` must be True, False or None. Each other field must be a positive, finite number, `rtol` below 1. The step
-    must not be longer than the duration. At most `MAX_SOLVER_STEPS` steps are allowed.
-    """
-    if not isinstance(solver, FixedStep | Adaptive):
-        solvers = "d.FixedStep(step=..., duration=...) or d.Adaptive(rtol=..., duration=...)"
-        return [f"solver = {kinds.format_value(solver)} is no solver; {solvers} is needed"]
-    names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
-    if lines := [f"solver.{name} {line}" for name in names if (line := _find_field_fault(name, getattr(solver, name)))]:
-        return lines
-    kinks = getattr(solver, "kinks", None)
-    if not (kinks is None or isinstance(kinks, bool)):
-        return [f"solver.kinks = {kinks!r} is not a Python bool; True, False or None is needed"]
-    step, duration = solver.step, solver.duration
-    if step > duration:
-        return [
-            f"solver.step = {step:g} s is outside (0, {duration:g}] s: longer than solver.duration = {duration:g} s"
-        ]
-    if duration / step > MAX_SOLVER_STEPS:
-        shortest = duration / MAX_SOLVER_STEPS
-        return [f"solver.step = {step:g} s is outside [{shortest:g}, {duration:g}] s: too many steps"]
-    return []
-
-
-def _find_field_fault(name: str, value: Any) -> str:
-    """Return the fault in the value of one field of a solver, or an empty string."""
-    if isinstance(value, Tracer):
-        return "is traced; a number that is known before the trace is needed"
-    if line := kinds.find_value_objection(value) or (
-        kinds.value_shape(value) and f"has shape {kinds.value_shape(value)}"
-    ):
-        return f"= {kinds.format_value(value)} {line}; a number is needed"
-    if not 0 < value < math.inf:
-        return f"= {value} is not positive and finite"
-    if name == "rtol" and value >= 1:
-        return f"= {value} is outside (0, 1)"
-    return f"= {value} is no whole number" if name == "every" and value != int(value) else ""
 
 
 def find_unstable_step(loop: Loop, solver: Solver) -> Iterator[str]:

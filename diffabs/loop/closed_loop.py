@@ -11,7 +11,7 @@ A `Loop` is one pytree: every parameter of every part is a leaf with a dotted pa
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from functools import cache, reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from diffabs.core.protocols import (
     Clock,
     Feedforward,
     Memory,
+    Objective,
     Plant,
     Reference,
     Sample,
@@ -30,9 +31,10 @@ from diffabs.core.protocols import (
     Tracking,
     no_flow,
 )
-from diffabs.core.pytree import parameters, part, parts, pytree
+from diffabs.core.pytree import parameters, part, parts, prepare_parts, pytree
 from diffabs.core.summary import Summary
 from diffabs.core.types import Int, Part, PyTree, Scalar
+from diffabs.engine.hybrid import Margins
 
 
 class LoopState(NamedTuple):
@@ -47,6 +49,10 @@ class LoopState(NamedTuple):
     def flow(self) -> tuple[PyTree, ...]:
         """Return the integrated part of the state: plant state and continuous memories."""
         return (self.plant, *(m.flow for m in self[1:]))
+
+    def held(self) -> list[PyTree]:
+        """Return the held memories."""
+        return [memory.held for memory in self[1:]]
 
     def with_flow(self, flow: tuple[PyTree, ...]) -> "LoopState":
         """Return the state with the continuous memories in `flow` and the same held memories."""
@@ -69,7 +75,7 @@ class Signals(NamedTuple):
     recorded: dict[str, PyTree]
 
 
-Margins = dict[str, tuple[Any, ...]]  # of stop and blocks, by name; each one of "stop" ends a run
+AUDIT_METRIC = ""  # name of a plant's audit among the objectives; no metric has an empty name
 BLOCKS = ("sensor", "reference", "controller", "actuator")
 LOOP_SIGNALS = tuple(name for name in Sample._fields if name not in ("t", "output"))
 # Names that files and proofs give to other signals of a loop, and to their own columns and variables.
@@ -100,6 +106,12 @@ class Loop:
         shown = getattr(getattr(self.plant, "shows", None), "_fields", ())
         if clash := sorted(RESERVED_SIGNALS & set(shown)):
             yield f"plant.shows: no output can be called {', '.join(clash)}, like a signal of the loop or of its files"
+
+    def prepare_run(self) -> tuple["Loop", dict[str, Objective]]:
+        """Return the loop with all that is constant during a run computed, and the plant's audit, if there is one."""
+        loop = prepare_parts(self)
+        audit = getattr(loop.plant, "audit", None)
+        return loop, {AUDIT_METRIC: audit(loop.initial)} if audit else {}
 
     def start(self) -> LoopState:
         """Return the state at t = 0, before the first tick."""
@@ -138,6 +150,18 @@ class Loop:
             self.controller.flow(t, state.controller, tracking),
             self.actuator.flow(t, state.actuator, sample.command),
         )
+
+    def project(self, state: LoopState) -> LoopState:
+        """Return the state with that of the plant admissible."""
+        return state._replace(plant=self.plant.project(state.plant))
+
+    def join_state(self, flow: tuple[PyTree, ...], held: list[PyTree]) -> LoopState:
+        """Return the state of `LoopState.flow` and `LoopState.held`."""
+        return LoopState(flow[0], *(Memory(*parts) for parts in zip(flow[1:], held, strict=True)))
+
+    def leading(self, state: LoopState) -> Scalar:
+        """Return the plant's first output."""
+        return self.plant.output(state.plant)[0]
 
     @property
     def changes(self) -> bool:

@@ -1,0 +1,150 @@
+"""What the engine needs to know of a system: a flow between instants, and changes at them.
+
+    between instants   dz/dt = flow(t, state)     z: the integrated part of the state, `state.flow()`
+    at instants        state <- change(state)     an instant is a tick of a clock, or an event
+
+An event is the instant at which a margin falls through zero. The flow is smooth between instants but for comparisons,
+which the engine finds (`step.comparisons`). Clients: a closed loop (`loop.closed_loop.Loop`), the field of a user
+(`solve.FieldSystem`). A system without flow is a difference equation, one without clocks and margins a smooth field.
+
+A system is a pytree whose leaves are its parameters. Its state and its signals are pytrees, too.
+"""
+
+from collections.abc import Callable
+from typing import Any, Protocol, Self
+
+from diffabs.core.cubic import HermiteStep
+from diffabs.core.protocols import Clock, Objective
+from diffabs.core.types import Int, PyTree, Scalar
+
+Margins = dict[str, tuple[Any, ...]]  # by name; each one of "stop" ends a run
+Objectives = dict[str, Objective]
+Finish = Callable[[Any, Any, PyTree], tuple[Any, PyTree]]  # of system, objectives, last carry: result, last observation
+Observe = Callable[[Any, Scalar, Any, Any], PyTree]  # of system, time, state, and whether the run goes on
+
+
+class State(Protocol):
+    """The state of a system: an integrated part, and a held part that changes at instants only."""
+
+    def flow(self) -> PyTree:
+        """Return the integrated part."""
+        ...
+
+    def held(self) -> PyTree:
+        """Return the held part."""
+        ...
+
+    def with_flow(self, flow: PyTree) -> Self:
+        """Return the state with another integrated part."""
+        ...
+
+
+class Sampled(Protocol):
+    """What objectives read of a system at an instant, a pytree."""
+
+    def shown(self) -> PyTree:
+        """Return the part of it whose rates most objectives need: rates of all signals cost more."""
+        ...
+
+    def leading(self) -> PyTree:
+        """Return the signals of `HybridSystem.leading`."""
+        ...
+
+    def leading_scales(self) -> PyTree:
+        """Return the sizes of these signals."""
+        ...
+
+
+class Signals(Protocol):
+    """The signals of a system at an instant."""
+
+    @property
+    def sample(self) -> Sampled:
+        """What objectives read."""
+        ...
+
+    @property
+    def recorded(self) -> dict[str, PyTree]:
+        """Signals whose cubic over each step `change` receives, by name."""
+        ...
+
+
+class HybridSystem(Protocol):
+    """A flow dz/dt, and changes where margins fall through zero or clocks tick."""
+
+    @property
+    def changes(self) -> bool:
+        """Whether `change` may change a state."""
+        ...
+
+    @property
+    def ticks(self) -> bool:
+        """Whether there is a clock."""
+        ...
+
+    @property
+    def eventful(self) -> bool:
+        """Whether there are margins besides that of the stop."""
+        ...
+
+    @property
+    def jumps(self) -> bool:
+        """Whether a rate jumps where a comparison changes: then fixed steps end there for values, too."""
+        ...
+
+    @property
+    def recorders(self) -> tuple[str, ...]:
+        """Names of the signals that `change` receives over each step."""
+        ...
+
+    def prepare_run(self) -> "tuple[HybridSystem, dict[str, Objective]]":
+        """Return the system with all that is constant during a run computed, and further objectives of each run."""
+        ...
+
+    def start(self) -> State:
+        """Return the state at t = 0, before the first tick."""
+        ...
+
+    def signals(self, t: Scalar, state: Any) -> Any:
+        """Return the `Signals` at time `t` [s]."""
+        ...
+
+    def flow(self, t: Scalar, state: Any, signals: Any) -> PyTree:
+        """Return d(state.flow())/dt from the `signals` at (t, state)."""
+        ...
+
+    def margins(self, t: Scalar, state: Any, signals: Any, flow: Callable[[], PyTree]) -> Margins:
+        """Return the margins of the stop and of the events by name; `flow()` is d(state.flow())/dt."""
+        ...
+
+    def change(
+        self,
+        clock: Clock,
+        state: Any,
+        before: Any,
+        margins: Margins,
+        fired: Margins,
+        passed: dict[str, HermiteStep] | None = None,
+    ) -> Any:
+        """Return the state after an instant, of the state, the signals `before` it, and its margins.
+
+        `fired` is True for each margin that has fallen through zero. `passed` has the recorded signals over the step
+        that ends here; None at the start of a run.
+        """
+        ...
+
+    def next_tick(self, k: Int, h: Scalar) -> Int:
+        """Return the number of the first instant after the `k`-th at which a clock ticks, with a grid of `h` [s]."""
+        ...
+
+    def project(self, state: Any) -> Any:
+        """Return the nearest admissible state, after every step."""
+        ...
+
+    def join_state(self, flow: PyTree, held: PyTree) -> Any:
+        """Return the state with these two parts."""
+        ...
+
+    def leading(self, state: Any) -> PyTree:
+        """Return the signals whose errors limit an adaptive step, as do those of the states; () for none."""
+        ...
