@@ -120,15 +120,15 @@ class Sample(NamedTuple):
     command: Scalar  # output of the controller
     control: Scalar  # output of the actuator
 
-    def shown(self) -> "Shown":
+    def show(self) -> "Shown":
         """Return outputs and setpoint."""
         return Shown(self.output, self.setpoint)
 
-    def leading(self) -> Scalar:
+    def error_signals(self) -> Scalar:
         """Return the first output, whose error limits an adaptive step."""
         return self.output[0]
 
-    def leading_scales(self) -> Scalar:
+    def signal_scales(self) -> Scalar:
         """Return the greater one of |first output| and |setpoint|."""
         return jnp.maximum(jnp.abs(self.output[0]), jnp.abs(self.setpoint))
 
@@ -156,7 +156,7 @@ class Shown(NamedTuple):
     output: PyTree
     setpoint: Scalar
 
-    def shown(self) -> "Shown":
+    def show(self) -> "Shown":
         """Return all of it."""
         return self
 
@@ -200,7 +200,7 @@ class Segment(NamedTuple):
 
     def shown_cubic(self, read: Callable[[Shown], Scalar]) -> Cubic:
         """Return the cubic of `read`(shown), a function of the plant outputs and the setpoint."""
-        ends = (self.start.shown(), self.end.shown())
+        ends = (self.start.show(), self.end.show())
         first, last = (jax.tree.map(lambda rate: self.h * rate, rates) for rates in self.shown_rates())
         # The error of a step bounds a jump in the rates of the plant, so both of them are used. It does not see the
         # setpoint, whose rate may jump at the end of a step.
@@ -236,4 +236,4 @@ def resting_segment(sample: Sample, h: Scalar) -> Segment:
     """Return a segment of length h [s] in which nothing moves."""
     sample = jax.tree.map(jnp.asarray, sample)
     still = jax.tree.map(jnp.zeros_like, sample)
-    return Segment(sample, sample, h, h, lambda: (still.shown(), still.shown()), lambda: (still, still))
+    return Segment(sample, sample, h, h, lambda: (still.show(), still.show()), lambda: (still, still))

@@ -23,14 +23,14 @@ Finish = Callable[[Any, Any, PyTree], tuple[Any, PyTree]]  # of system, objectiv
 Observe = Callable[[Any, Scalar, Any, Any], PyTree]  # of system, time, state, and whether the run goes on
 
 
-class State(Protocol):
+class HybridState(Protocol):
     """The state of a system: an integrated part, and a held part that changes at instants only."""
 
     def flow(self) -> PyTree:
         """Return the integrated part."""
         ...
 
-    def held(self) -> PyTree:
+    def memories(self) -> PyTree:
         """Return the held part."""
         ...
 
@@ -39,27 +39,27 @@ class State(Protocol):
         ...
 
 
-class Sampled(Protocol):
+class HybridSample(Protocol):
     """What objectives read of a system at an instant, a pytree."""
 
-    def shown(self) -> PyTree:
+    def show(self) -> PyTree:
         """Return the part of it whose rates most objectives need: rates of all signals cost more."""
         ...
 
-    def leading(self) -> PyTree:
-        """Return the signals of `HybridSystem.leading`."""
+    def error_signals(self) -> PyTree:
+        """Return the signals of `HybridSystem.error_signals`."""
         ...
 
-    def leading_scales(self) -> PyTree:
+    def signal_scales(self) -> PyTree:
         """Return the sizes of these signals."""
         ...
 
 
-class Signals(Protocol):
+class HybridSignals(Protocol):
     """The signals of a system at an instant."""
 
     @property
-    def sample(self) -> Sampled:
+    def sample(self) -> HybridSample:
         """What objectives read."""
         ...
 
@@ -101,12 +101,12 @@ class HybridSystem(Protocol):
         """Return the system with all that is constant during a run computed, and further objectives of each run."""
         ...
 
-    def start(self) -> State:
+    def start(self) -> HybridState:
         """Return the state at t = 0, before the first tick."""
         ...
 
     def signals(self, t: Scalar, state: Any) -> Any:
-        """Return the `Signals` at time `t` [s]."""
+        """Return the `HybridSignals` at time `t` [s]."""
         ...
 
     def flow(self, t: Scalar, state: Any, signals: Any) -> PyTree:
@@ -128,7 +128,7 @@ class HybridSystem(Protocol):
     ) -> Any:
         """Return the state after an instant, of the state, the signals `before` it, and its margins.
 
-        `fired` is True for each margin that has fallen through zero. `passed` has the recorded signals over the step
+        Where a run ends it is not called. `fired` is True for each margin that has fallen through zero. `passed` has the recorded signals over the step
         that ends here; None at the start of a run.
         """
         ...
@@ -145,6 +145,6 @@ class HybridSystem(Protocol):
         """Return the state with these two parts."""
         ...
 
-    def leading(self, state: Any) -> PyTree:
+    def error_signals(self, state: Any) -> PyTree:
         """Return the signals whose errors limit an adaptive step, as do those of the states; () for none."""
         ...

@@ -196,7 +196,7 @@ class FieldState(NamedTuple):
         """Return the state of the field."""
         return self.y
 
-    def held(self) -> Any:
+    def memories(self) -> Any:
         """Return the memory of the events."""
         return self.events
 
@@ -211,15 +211,15 @@ class FieldSample(NamedTuple):
     t: Scalar
     y: PyTree
 
-    def shown(self) -> "FieldSample":
+    def show(self) -> "FieldSample":
         """Return all of it."""
         return self
 
-    def leading(self) -> tuple[()]:
+    def error_signals(self) -> tuple[()]:
         """Return nothing: the states' errors alone limit a step."""
         return ()
 
-    leading_scales = leading
+    signal_scales = error_signals
 
 
 class FieldSignals(NamedTuple):
@@ -322,7 +322,7 @@ class FieldSystem:
         """Return the state: all are admissible."""
         return state
 
-    def leading(self, state: FieldState) -> tuple[()]:
+    def error_signals(self, state: FieldState) -> tuple[()]:
         """Return nothing: the states' errors alone limit a step."""
         del state
         return ()

@@ -50,7 +50,7 @@ class LoopState(NamedTuple):
         """Return the integrated part of the state: plant state and continuous memories."""
         return (self.plant, *(m.flow for m in self[1:]))
 
-    def held(self) -> list[PyTree]:
+    def memories(self) -> list[PyTree]:
         """Return the held memories."""
         return [memory.held for memory in self[1:]]
 
@@ -156,10 +156,10 @@ class Loop:
         return state._replace(plant=self.plant.project(state.plant))
 
     def join_state(self, flow: tuple[PyTree, ...], held: list[PyTree]) -> LoopState:
-        """Return the state of `LoopState.flow` and `LoopState.held`."""
+        """Return the state of `LoopState.flow` and `LoopState.memories`."""
         return LoopState(flow[0], *(Memory(*parts) for parts in zip(flow[1:], held, strict=True)))
 
-    def leading(self, state: LoopState) -> Scalar:
+    def error_signals(self, state: LoopState) -> Scalar:
         """Return the plant's first output."""
         return self.plant.output(state.plant)[0]
 

@@ -213,6 +213,7 @@ def kernel_objection(loop: Loop, values: Params, solver: Solver, objectives: Map
     """
     from diffabs.engine.drive.kernel import find_objection
 
+    check_process()
     if is_traced(loop, dict(values), dict(objectives)):
         return "this is traced; ask with numbers"
     prepared, columns, method, measured = _prepare_batch(loop, values, solver, objectives)

@@ -214,7 +214,7 @@ def test_a_shorter_step_that_turns_a_number_into_never(file, most, turned):
 
 
 @killed_by("loop.checking", "if differs_in_kind(value, finer_value):", "if False:")
-@killed_by("engine.solvers", "~(np.isnan(first) & np.isnan(second))", "True", case="both NaN")
+@killed_by("loop.result", "~(np.isnan(first) & np.isnan(second))", "True", case="both NaN")
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("one", "other", "words"), PAIRS.values(), ids=PAIRS)
 def test_a_change_to_never_is_the_largest_of_rtol(one, other, words):

@@ -27,6 +27,7 @@ from diffabs.compiler.runtime import cpu, library_cache, toolchain
 from diffabs.core.lanes import any_lane
 from diffabs.engine.drive import kernel as native
 from diffabs.engine.drive.engine import ENGINE_VARIABLE, log_kernel, log_xla_reason
+from diffabs.loop import ensemble
 from diffabs.parts.objectives import BRAKING
 from diffabs.parts.stops import SpeedReached
 from diffabs.scenario import section_sweep
@@ -155,7 +156,7 @@ class TestObjections:
     """Each is said by `objection`, refused with engine = "kernel", and said once with "auto"."""
 
     def test_there_is_none(self):
-        assert native.kernel_objection(LOOP, VALUES, SOLVER, MEASURED) is None
+        assert ensemble.kernel_objection(LOOP, VALUES, SOLVER, MEASURED) is None
 
     @pytest.mark.slow
     @killed_by("compiler.runtime.toolchain", "if configured is not None and not configured.strip():", "if False:")
@@ -166,7 +167,7 @@ class TestObjections:
         log_xla_reason.cache_clear()
         native._run.clear_cache()
         loop = d.replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
-        line = native.kernel_objection(loop, VALUES, SOLVER, {})
+        line = ensemble.kernel_objection(loop, VALUES, SOLVER, {})
         assert line == f"{toolchain.COMPILER} is empty"
         with pytest.raises(ValueError, match=f"engine = 'kernel' is not possible: {line}"):
             d.run_batch(loop, d.Batch(VALUES), SOLVER, {}, accepted=True, engine="kernel")

@@ -27,6 +27,7 @@ from diffabs.compiler.emit import cuda
 from diffabs.compiler.runtime import gpu, library_cache, nvrtc
 from diffabs.compiler.runtime.toolchain import NoCompiler
 from diffabs.engine.drive import kernel as native
+from diffabs.loop import ensemble
 from diffabs.scenario.defaults import braking
 
 pytestmark = pytest.mark.xdist_group("kernel cuda")
@@ -196,7 +197,7 @@ class TestObjections:
     def test_of_a_gpu_of_another_make(self, monkeypatch):
         replace_seam(monkeypatch, "gpu_devices", lambda: [Home("gpu", "gfx942")])
         line = "kernels are for processors and NVIDIA's GPUs, not for gpu gfx942"
-        assert native.kernel_objection(LOOP, VALUES, SOLVER, MEASURED) == line
+        assert ensemble.kernel_objection(LOOP, VALUES, SOLVER, MEASURED) == line
         replace_seam(monkeypatch, "gpu_devices", lambda: [Home("gpu", "9.0")])
         assert gpu.find_gpu().architecture == "sm_90"
 

@@ -96,7 +96,7 @@ import os
 import diffabs as d
 from diffabs import scenario
 from diffabs.engine.drive import engine
-from diffabs.engine.drive import kernel as native
+from diffabs.loop import ensemble
 
 def in_a_child(task):
     if child := os.fork():
@@ -114,7 +114,7 @@ loop = scenario.load("slip-lmi").loop
 lanes = d.Batch({"initial.speed": [8.0, 9.0]})
 in_a_child(lambda: d.run_batch(loop, lanes, d.FixedStep(1e-3, 0.02), {}, engine="kernel"))
 in_a_child(lambda: in_a_child(lambda: d.run_batch(loop, lanes, d.FixedStep(1e-3, 0.02), {}, engine="auto")))
-in_a_child(lambda: native.kernel_objection(loop, {"initial.speed": [8.0, 9.0]}, d.FixedStep(1e-3, 0.02), {}))
+in_a_child(lambda: ensemble.kernel_objection(loop, {"initial.speed": [8.0, 9.0]}, d.FixedStep(1e-3, 0.02), {}))
 engine.check_process()
 """
 

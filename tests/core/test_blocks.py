@@ -280,8 +280,8 @@ def test_the_integral_of_an_error_that_changes_sign(h):
 @pytest.mark.slow
 @killed_by(
     "core.messages",
-    "self.start.shown(), self.end.shown()",
-    "self.start.shown(), self.end.shown()._replace(setpoint=self.start.setpoint)",
+    "self.start.show(), self.end.show()",
+    "self.start.show(), self.end.show()._replace(setpoint=self.start.setpoint)",
 )
 @killed_by(
     "core.messages",

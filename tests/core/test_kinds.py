@@ -148,8 +148,8 @@ def test_objectives_are_looked_at_too():
         ((1e-3, 0.5), "solver = (0.001, 0.5) is no solver; d.FixedStep(step=..., duration=...) or d.Adaptive(rtol="),
     ],
 )
-@killed_by("loop.admissible", "if not 0 < value < math.inf:", "if False:")
-@killed_by("loop.admissible", '"rtol" and value >= 1', '"rtol" and value >= 99')
+@killed_by("engine.solvers", "if not 0 < value < math.inf:", "if False:")
+@killed_by("engine.solvers", '"rtol" and value >= 1', '"rtol" and value >= 99')
 def test_a_solver_that_no_run_can_have(solver, message):
     """A run, a check of one loop, and a check of a batch say the same."""
     batch = d.Batch({"plant.mass": [5.3]})

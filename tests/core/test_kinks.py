@@ -419,7 +419,7 @@ def integrating(late: float) -> tuple[Loop, float]:
     return Loop(**{**vars(loop), **parts}), most**2 * leaves + square(END - late) - square(leaves)
 
 
-@killed_by("engine.step.fixed", "loop.jumps if self.kinks is None", "False if self.kinks is None")
+@killed_by("engine.step.fixed", "hybrid.jumps if self.kinks is None", "False if self.kinks is None")
 @pytest.mark.parametrize("late", [0.0, pytest.param(0.0337, marks=pytest.mark.slow)])
 def test_where_a_rate_jumps_a_value_is_right_too(late):
     """An integral that waits for a limit starts at once when the limit is left: in the middle of a step of 10 ms, which

@@ -93,8 +93,8 @@ def test_every_argument_of_an_exported_function_is_described(name):
 
 
 MOST_USED = {
-    *("core.pytree.replace", "engine.run.rollout", "engine.run.measure", "loop.ensemble.run_batch"),
-    *("engine.solve.solve", "engine.types.FixedStep", "engine.types.Adaptive", "parts.controllers.pid.PID"),
+    *("core.pytree.replace", "loop.run.rollout", "loop.run.measure", "loop.ensemble.run_batch"),
+    *("engine.solve.solve", "engine.solvers.FixedStep", "engine.solvers.Adaptive", "parts.controllers.pid.PID"),
     *("linear.regulator.lqr", "linear.riccati.care", "linear.stability_margins.margins"),
     *("robust.design.synthesis.design", "robust.design.analysis.certify", "scenario.proofs.prove_box"),
     *("tune.tuning.tune", "tune.tuning.build_problem", "tune.worst.worst_case"),

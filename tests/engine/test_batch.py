@@ -366,7 +366,7 @@ def test_a_column_without_numbers_is_refused(given, message):
         Batch(**given)
 
 
-@killed_by("engine.drive.packed", "first_order((loop, values, objectives), VALUES_ONLY)", "loop, values, objectives")
+@killed_by("engine.drive.packed", "first_order((hybrid, values, objectives), VALUES_ONLY)", "loop, values, objectives")
 @pytest.mark.parametrize("solver", [SOLVER, d.Adaptive(1e-4, 0.5)])
 def test_lanes_that_make_room_have_no_derivative_by_xla(solver):
     """Of fixed steps it was 1.4 % off: the switches were not located."""

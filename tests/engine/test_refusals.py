@@ -145,7 +145,7 @@ class TestBeforeARun:
             found = admissible.batch_admissibility(loop, {"plant.mass": np.array([5.3, -1.0])}, SOLVER)
             assert found.accepted.tolist() == [True, False], found.texts
 
-    @killed_by("loop.admissible", "if not (kinks is None or isinstance(kinks, bool)):", "if False:")
+    @killed_by("engine.solvers", "if not (kinks is None or isinstance(kinks, bool)):", "if False:")
     def test_a_solver_that_fits_nothing_is_named(self, any_step):
         for solver, message in (
             (d.FixedStep(0.3, 0.25), "longer than solver.duration"),
@@ -242,7 +242,7 @@ class TestBeforeARun:
 
 class TestAfterARun:
     @pytest.mark.slow
-    @killed_by("loop.result", 'audit = getattr(loop.plant, "audit", None)', "audit = None")
+    @killed_by("loop.closed_loop", 'audit = getattr(loop.plant, "audit", None)', "audit = None")
     @pytest.mark.parametrize("step", [1e-4, 1e-3])
     def test_an_unstable_step_with_finite_numbers_is_refused(self, step):
         """At 1e-6 s the run ends after three steps at -1e13 m: it has not stopped, and there is no mean to enter."""

@@ -536,7 +536,7 @@ def test_fixed_steps_of_a_smooth_field_are_rk4():
 
 
 @killed_by("engine.step.fixed", "end.rates[0] if self.smooth else ()", "()")
-@killed_by("engine.solve", 'loop.inputs["t1"], loop.time(point.t)', "loop.time(point.t), loop.time(point.t)")
+@killed_by("engine.solve", 'system.inputs["t1"], system.time(point.t)', "system.time(point.t), system.time(point.t)")
 def test_the_last_fixed_step_ends_at_t1_within_the_domain():
     def field(t, y, args):
         return t**3, jnp.sqrt(args - y[0])  # y[0] = 1/4 at t = 1

@@ -95,7 +95,7 @@ def test_a_class_in_the_place_of_a_part(parts, line):
     assert message(Study(loop=loop, space=space, samples=4, solver=SOLVER, objectives={"iae": IAE()}).check) == line
 
 
-@killed_by("engine.solvers", 'if name in self.metrics else f"; {metrics}"', 'if False else f"; {metrics}"')
+@killed_by("loop.result", 'if name in self.metrics else f"; {metrics}"', 'if False else f"; {metrics}"')
 def test_a_metric_that_is_asked_of_the_run():
     run = d.measure(d.braking(), SOLVER, {"iae": IAE(), "overshoot": Overshoot()})
     assert message(lambda: run.iae, error=AttributeError) == 'a Run has no field iae; run.metrics["iae"] is a metric'

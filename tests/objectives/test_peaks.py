@@ -23,7 +23,7 @@ def step(h, smooth, within=(True, True), **signals):
         return parts.balancing_at(t)._replace(**{name: signal(t) for name, signal in signals.items()})
 
     (a, da), (b, db) = (jax.jvp(at, (t,), (jnp.ones_like(t),)) for t in jnp.array([0.0, h]))
-    return Segment(a, b, h, h, lambda: (da.shown(), db.shown()), lambda: (da, db), smooth, within)
+    return Segment(a, b, h, h, lambda: (da.show(), db.show()), lambda: (da, db), smooth, within)
 
 
 @killed_by("parts.objectives.balance", "if segment.smooth is not False:", "if False:", case="True-24.0")

@@ -41,7 +41,7 @@ class Mutant(NamedTuple):
 def killed_by(module: str, old: str, new: str, case: str | None = None) -> pytest.MarkDecorator:
     """Return a mark for a test that fails where each `old` in a module of diffabs is replaced by `new`.
 
-    module: "engine.run", or the path of a file that is no module, "compiler/native/drive.h"
+    module: "loop.run", or the path of a file that is no module, "compiler/native/drive.h"
     case: the id of the parameters with which it fails; by default with any"""
     return pytest.mark.killed_by(module, old, new, case)
 

@@ -351,7 +351,7 @@ def objective_run(objective: Any, sample_at: Any = None, end: float = 0.5, steps
         t = k * h
         flow = rk4_step(lambda t, z: objective.flow(Memory(z, memory.held), sample_at(t)), t, memory.flow, h)
         (a, da), (b, db) = (jax.jvp(sample_at, (x,), (jnp.ones_like(x),)) for x in (t, t + h))
-        segment = Segment(a, b, h, h, lambda: (da.shown(), db.shown()), lambda: (da, db))
+        segment = Segment(a, b, h, h, lambda: (da.show(), db.show()), lambda: (da, db))
         return Memory(flow, objective.update(Memory(flow, memory.held), segment)), None
 
     memory, _ = jax.lax.scan(step, objective.start(sample_at(0.0 * h)), jnp.arange(steps))

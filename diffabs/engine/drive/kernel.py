@@ -184,7 +184,6 @@ def find_objection(
     A reason is an operation without a translation, or no compiler on this machine. The function executes no run, but it
     compiles and keeps the kernel. `values` have at least one path, with columns (runs, ...).
     """
-    check_process()
     count = len(next(iter(values.values())))
     keys = jax.vmap(jax.random.key)(jnp.arange(count))
     arguments = hybrid, values, objectives, method, keys, jnp.ones(count, bool), None, None

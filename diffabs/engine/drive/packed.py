@@ -16,7 +16,7 @@ from diffabs.core.pytree import replace
 from diffabs.core.tracing import split_batched
 from diffabs.core.types import Array, Bool, Params, PyTree, Scalar, Vector
 from diffabs.engine.drive.loops import STEPS_PER_BLOCK, MethodCarry
-from diffabs.engine.hybrid import Finish, HybridSystem, Objectives, Sampled
+from diffabs.engine.hybrid import Finish, HybridSample, HybridSystem, Objectives
 from diffabs.engine.step.status import RunStatus
 
 LANES_AT_ONCE = 512  # runs that step at a time: their state stays in a processor's cache
@@ -74,7 +74,7 @@ def split_by_lane(
     return leaves, build_lane
 
 
-def sample_now(hybrid: HybridSystem, carry: MethodCarry) -> Sampled:
+def sample_now(hybrid: HybridSystem, carry: MethodCarry) -> HybridSample:
     """Return the sample of a run at its present point."""
     return hybrid.signals(carry.point.t, carry.point.state).sample
 

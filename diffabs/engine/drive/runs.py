@@ -36,7 +36,7 @@ from diffabs.engine.hybrid import Finish, HybridSystem, Objectives, Observe
 from diffabs.engine.solvers import Adaptive, Solver
 from diffabs.engine.step.adaptive import AdaptiveStepping, clip_rtol
 from diffabs.engine.step.fixed import FixedStepping
-from diffabs.engine.step.replay import ReplayStepping, log_attempt, refuse_derivative, states_between
+from diffabs.engine.step.replay import ReplayStepping, log_attempt, log_capacity, refuse_derivative, states_between
 from diffabs.engine.step.slides import has_slid, slide_of
 from diffabs.engine.step.status import end_unfinished
 
@@ -70,6 +70,29 @@ def build_stepping(solver: Solver, dtype: DTypeLike) -> FixedStepping | Adaptive
     if isinstance(solver, Adaptive):
         return AdaptiveStepping(h, steps, number(float(clip_rtol(np.asarray(solver.rtol, dtype))), dtype))
     return FixedStepping(h, steps, solver.kinks)
+
+
+def run_system(
+    system: HybridSystem, solver: Solver, finish: Finish, objectives: Objectives | None = None, key: Key | None = None
+) -> PyTree:
+    """Return a run of any hybrid system, as `finish` makes it of the last carry; differentiable by the system's leaves.
+
+    Args:
+        system: The system, a pytree whose leaves are arrays of one type.
+        solver: Steps and duration [s].
+        finish: Function of system, objectives and the last `Carry`, such as `lambda system, objectives, carry:
+            (carry.point.state, None)`. It must be the same function in each call: the program is compiled for it.
+        objectives: Objectives by name, whose accumulators the carry has.
+        key: Random key, which `HybridSystem.change` reads.
+
+    See also:
+        `solve`: Fields with events, without a class.
+        `rollout`: Closed loops.
+    """
+    method = build_stepping(solver, jax.tree.leaves(system)[0].dtype)
+    room = log_capacity(system, solver) if isinstance(solver, Adaptive) else solver.steps
+    capacity = RunCapacity(finish, None, round_up_capacity(room))
+    return run_differentiable(capacity, (system, objectives or {}, method, key))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

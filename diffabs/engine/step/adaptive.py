@@ -30,7 +30,7 @@ from diffabs.core.cubic import HermiteStep
 from diffabs.core.lanes import any_lane, select
 from diffabs.core.log import borrow
 from diffabs.core.types import Any, AnyArray, Array, Bool, Int, Key, PyTree, Scalar
-from diffabs.engine.hybrid import HybridSystem, State
+from diffabs.engine.hybrid import HybridState, HybridSystem
 from diffabs.engine.step.advance import (
     Carry,
     Decision,
@@ -106,10 +106,10 @@ class StateSpan(NamedTuple):
         flow: Its integrated part over the step.
     """
 
-    state: State
+    state: HybridState
     flow: HermiteStep
 
-    def at(self, t: Scalar) -> State:
+    def at(self, t: Scalar) -> HybridState:
         """Return the state at a time `t` [s] within the step."""
         return self.state.with_flow(self.flow.at(t))
 
@@ -120,7 +120,7 @@ class AdaptiveControl(NamedTuple):
     Attributes:
         error_limited: Length that the error allows [s].
         limit: Longest stable step [s].
-        scale: Largest values of the leading signals and of the states so far, as `error_scales` returns them.
+        scale: Largest values of the `error_signals` and of the states so far, as `error_scales` returns them.
         tries: Number of attempts so far.
         tries_at_renewal: Number of attempts at the last update of the stability limit.
         last_step: Last step, a `StateSpan`; () without a trajectory.
@@ -148,7 +148,7 @@ class AdaptiveReport(NamedTuple):
 
     Attributes:
         error: Error as a multiple of the allowed error.
-        scale: Largest values of the leading signals and of the states so far, as `error_scales` returns them.
+        scale: Largest values of the `error_signals` and of the states so far, as `error_scales` returns them.
         past_crossing: Time from the first change of a comparison inside the step, or the first turn of a margin beyond
             zero, to the end of the step [s]; 0 without one.
         grazes: True if a margin only touches zero, or crosses it twice in a step that is too short to be cut.
@@ -242,7 +242,7 @@ class AdaptiveStepping:
         """Return True if the run of `carry` goes on and has not reached the instant `until` of the grid."""
         return carry.running if until is None else carry.running & (carry.point.t < until * self.h)
 
-    def state_at(self, carry: Carry, instant: Scalar) -> tuple[Any, State, Bool]:
+    def state_at(self, carry: Carry, instant: Scalar) -> tuple[Any, HybridState, Bool]:
         """Return time, state, and whether the run goes on, at an `instant` of the grid within the last step."""
         now, t, last = carry.point, instant * self.h, carry.control.last_step
         # The last step is a cubic, so the instant may lie anywhere in it. A run that is over shows its last point.
@@ -281,7 +281,7 @@ class AdaptiveStepping:
         return self._look_ahead(carry.control.error_limited, carry.unrestricted, fresh, dynamics)
 
     def report(
-        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: State, error: PyTree
+        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: HybridState, error: PyTree
     ) -> AdaptiveReport:
         """Return the error of an attempt, and the comparisons that change in it."""
         sample, point = dynamics.signals.sample, carry.point
@@ -408,8 +408,10 @@ class AdaptiveStepping:
         status = jnp.where(report.grazes, RunStatus.GRAZED, status)
         return jnp.where(slides, RunStatus.SLID, status)
 
-    def _find_stability_limit(self, hybrid: HybridSystem, t: Array, state: State, scale: Array) -> Scalar:
-        """Return the longest stable step [s]; the whole span if the Jacobian of the `hybrid` is not finite."""
+    def _find_stability_limit(self, hybrid: HybridSystem, t: Array, state: HybridState, scale: Array) -> Scalar:
+        """Return the longest stable step [s]; the whole span without a flow, or if its Jacobian is not finite."""
+        if not jax.tree.leaves(state.flow()):
+            return self.h * self.steps
         limit = spectral_step_limit(hybrid, t, state, scale)
         return jnp.where(limit > 0, limit, self.h * self.steps)  # False also for NaN
 

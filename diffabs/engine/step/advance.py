@@ -21,7 +21,7 @@ from diffabs.core.lanes import any_lane, jit_barrier, keep_decision, select
 from diffabs.core.log import borrow, log_rows, write_last_rows
 from diffabs.core.protocols import Clock
 from diffabs.core.types import Array, Bool, Int, PyTree, Scalar
-from diffabs.engine.hybrid import HybridSystem, Margins, State
+from diffabs.engine.hybrid import HybridState, HybridSystem, Margins
 from diffabs.engine.step.attempt import (
     Attempt,
     Point,
@@ -164,7 +164,7 @@ class Stepping(Protocol):
         ...
 
     def report(
-        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: State, error: object
+        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: HybridState, error: object
     ) -> Any:
         """Return the findings about an attempt, by the run of `carry` in `system`, that the method needs.
 

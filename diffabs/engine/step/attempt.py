@@ -20,7 +20,7 @@ from diffabs.core.log import borrow
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment
 from diffabs.core.types import Any, Array, Bool, Int, PyTree, Scalar
-from diffabs.engine.hybrid import HybridSystem, Margins, Objectives, Signals, State
+from diffabs.engine.hybrid import HybridSignals, HybridState, HybridSystem, Margins, Objectives
 from diffabs.engine.step.modes import Mode, ModeBits, single_bit
 from diffabs.engine.step.runge_kutta import Tableau, runge_kutta_step
 from diffabs.engine.step.surfaces import valid_end_rates
@@ -42,7 +42,7 @@ class Point(NamedTuple):
         accumulators: Accumulators of the objectives.
         sample: Sample of the signals.
         signal_rates: Rates of the signals, as `ObservedSystem.signal_rates` says.
-        recorded: Signals that blocks record, and their rates, each by block.
+        recorded: Recorded signals, and their rates, each by name.
         rates: Rates of the loop's flow and of the objectives' integrals.
         margins: Margins of the stop and of the blocks' events.
         words: Answers to the comparisons: the mode of the next step.
@@ -50,7 +50,7 @@ class Point(NamedTuple):
     """
 
     t: Array
-    state: State
+    state: HybridState
     accumulators: Accumulators
     sample: PyTree
     signal_rates: PyTree
@@ -91,13 +91,13 @@ class Attempt(NamedTuple):
 
     Attributes:
         point: The end, before the changes there.
-        signals: Signals of the loop.
+        signals: Signals of the system.
         shift: Time [s] by which the end lies later than requested.
         report: What the stepping method needs for its decision.
     """
 
     point: Point
-    signals: Signals
+    signals: HybridSignals
     shift: Scalar
     report: PyTree
 
@@ -105,7 +105,7 @@ class Attempt(NamedTuple):
 Forecast = Callable[[Evaluation], PyTree]  # `Stepping.forecast`, for a run
 
 
-def start_state(hybrid: HybridSystem, objectives: Objectives, clock: Clock) -> tuple[State, Accumulators]:
+def start_state(hybrid: HybridSystem, objectives: Objectives, clock: Clock) -> tuple[HybridState, Accumulators]:
     """Return state and accumulators at t = 0, after the first ticks and the events of blocks with a negative margin."""
     state = hybrid.start()
     signals = hybrid.signals(clock.t, state)
@@ -117,7 +117,7 @@ def start_state(hybrid: HybridSystem, objectives: Objectives, clock: Clock) -> t
 
 
 def evaluate_point(
-    system: ObservedSystem, t: Array, state: State, accumulators: Accumulators, mode: Mode, forecast: Forecast
+    system: ObservedSystem, t: Array, state: HybridState, accumulators: Accumulators, mode: Mode, forecast: Forecast
 ) -> Point:
     """Return the point at an instant, from the state after the changes there."""
     return _build_point(system.evaluate(t, state, accumulators, mode), t, state, accumulators, forecast)
@@ -129,7 +129,7 @@ def attempt_step(
     request: StepRequest,
     tableau: Tableau,
     forecast: Forecast,
-    report: Callable[[Evaluation, State, PyTree], PyTree],
+    report: Callable[[Evaluation, HybridState, PyTree], PyTree],
 ) -> Attempt:
     """Return the end of one Runge-Kutta step from a point.
 
@@ -164,7 +164,7 @@ def attempt_step(
     rates = (point.signal_rates, dynamics.signal_rates)
     segment = Segment(
         *(point.sample, dynamics.signals.sample, h, request.grid),
-        shown_rates=lambda: (rates[0].shown(), rates[1].shown()),
+        shown_rates=lambda: (rates[0].show(), rates[1].show()),
         sample_rates=lambda: rates,
         smooth=smooth,
         within=within,
@@ -233,7 +233,9 @@ def flip_answer(system: ObservedSystem, words: ModeBits, number: Array, lands: B
     return tuple(word ^ jnp.where(lands, bit, jnp.uint32(0)) for word, bit in zip(words, bits, strict=True))
 
 
-def _build_point(dynamics: Evaluation, t: Any, state: State, accumulators: Accumulators, forecast: Forecast) -> Point:
+def _build_point(
+    dynamics: Evaluation, t: Any, state: HybridState, accumulators: Accumulators, forecast: Forecast
+) -> Point:
     signals = dynamics.signals
     return Point(
         *(t, state, accumulators, signals.sample, dynamics.signal_rates, (signals.recorded, dynamics.recorded_rates)),

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
-from diffabs.engine.hybrid import HybridSystem, State
+from diffabs.engine.hybrid import HybridState, HybridSystem
 from diffabs.engine.step.advance import (
     Carry,
     Decision,
@@ -120,7 +120,7 @@ class FixedStepping:
         """Return True if the run of `carry` goes on and has not reached the instant `until` of the grid."""
         return carry.running if until is None else carry.running & (carry.k < until)
 
-    def state_at(self, carry: Carry, instant: Scalar) -> tuple[Array, State, Bool]:
+    def state_at(self, carry: Carry, instant: Scalar) -> tuple[Array, HybridState, Bool]:
         """Return time, state, and whether the run goes on, at an `instant` of the grid that the `carry` has reached."""
         del instant
         return carry.point.t, carry.point.state, carry.running
@@ -161,7 +161,7 @@ class FixedStepping:
         return look_ahead(carry.status == RunStatus.REFRESHING, dynamics) if self.watches else ()
 
     def report(
-        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: State, error: object
+        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: HybridState, error: object
     ) -> FixedStepReport:
         """Return the comparisons that an attempt contradicts at its end, and whether a margin grazes zero."""
         del state, error

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from diffabs.core.cubic import Cubic, HermiteStep
 from diffabs.core.lanes import any_lane
 from diffabs.core.types import Array, Bool, PyTree, Scalar
-from diffabs.engine.hybrid import State
+from diffabs.engine.hybrid import HybridState
 from diffabs.engine.step.attempt import mode_in_step
 from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.system import Evaluation, ObservedSystem
@@ -99,7 +99,7 @@ def watch_margins(carry: PyTree, h: Scalar, dynamics: Evaluation, bit_count: int
     return Turns(jnp.where(running, turns.time_since, 0.0), (running | landing) & turns.grazes)
 
 
-def margin_error(system: ObservedSystem, carry: PyTree, h: Scalar, dynamics: Evaluation, state: State) -> Scalar:
+def margin_error(system: ObservedSystem, carry: PyTree, h: Scalar, dynamics: Evaluation, state: HybridState) -> Scalar:
     """Return the error of the margins' cubics in the middle of an attempt, as a multiple of the allowed one.
 
     A margin may depend on time alone, and then no error of a state shows its error. The result is 0 without margins,

@@ -24,7 +24,7 @@ import numpy as np
 
 from diffabs.core.lanes import any_lane, select
 from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
-from diffabs.engine.hybrid import HybridSystem, State
+from diffabs.engine.hybrid import HybridState, HybridSystem
 from diffabs.engine.solvers import ADAPTIVE_ERROR_ORDER, Adaptive
 from diffabs.engine.step.adaptive import AdaptiveStepping, StateSpan, clip_rtol, span_step
 from diffabs.engine.step.advance import Carry, Decision, advance, cast_floats, start_carry
@@ -160,7 +160,7 @@ class ReplayStepping:
         return ()
 
     def report(
-        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: State, error: object
+        self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: HybridState, error: object
     ) -> PyTree:
         """Return nothing: the log has the decisions."""
         del system, carry, h, dynamics, state, error
@@ -271,7 +271,7 @@ def log_attempt(old: Carry, new: Carry) -> StepLog:
     )
 
 
-def states_between(spans: StateSpan, accepted: Bool, instants: Array) -> State:
+def states_between(spans: StateSpan, accepted: Bool, instants: Array) -> HybridState:
     """Return the states at the times `instants` (n,) [s], leaves (n, ...), from the steps of a replayed run.
 
     The spans have leaves (blocks, attempts, ...). That of an attempt that was not `accepted` (blocks, attempts) is that

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from diffabs.core.numerics import clamp
 from diffabs.core.types import Array, Int, PyTree, Scalar, Vector
-from diffabs.engine.hybrid import HybridSystem, State
+from diffabs.engine.hybrid import HybridState, HybridSystem
 
 INITIAL_STEP_S = 1e-4  # s, the first step
 SAFETY, MIN_ERROR = 0.85, 1e-6  # fraction of the optimal length; offset that keeps the length finite for an error of 0
@@ -29,20 +29,20 @@ MAX_UNROLLED_STATES = 12  # numbers of a flow: the Jacobian of a larger one is n
 MIN_CROSSING_STEP_FRACTION = 4e-3  # fraction of the length that the error allows: the shortest step to a crossing
 
 
-def error_scales(state: State, sample: PyTree) -> PyTree:
-    """Return the scales of the error: the sizes of the leading signals and of every state."""
-    return sample.leading_scales(), jax.tree.map(jnp.abs, state.flow())
+def error_scales(state: HybridState, sample: PyTree) -> PyTree:
+    """Return the scales of the error: the sizes of the `error_signals` and of every state."""
+    return sample.signal_scales(), jax.tree.map(jnp.abs, state.flow())
 
 
-def error_norm(hybrid: HybridSystem, state: State, state_errors: Scalar, scale: Scalar, sample: PyTree) -> PyTree:
-    """Return the greatest error of all states and of the leading signals, as a fraction of their scales.
+def error_norm(hybrid: HybridSystem, state: HybridState, state_errors: Scalar, scale: Scalar, sample: PyTree) -> PyTree:
+    """Return the greatest error of all states and of the `error_signals`, as a fraction of their scales.
 
     The errors of the states lie in the middle of the step. The signals are evaluated with them at the end of the
     step, as an approximation.
     """
     moved = state.with_flow(jax.tree.map(lambda x, d: x - d, state.flow(), state_errors))
-    leading = jax.tree.map(jnp.subtract, hybrid.leading(moved), sample.leading())
-    pairs = zip(jax.tree.leaves((leading, state_errors)), jax.tree.leaves(scale), strict=True)
+    signal_errors = jax.tree.map(jnp.subtract, hybrid.error_signals(moved), sample.error_signals())
+    pairs = zip(jax.tree.leaves((signal_errors, state_errors)), jax.tree.leaves(scale), strict=True)
     shares = [jnp.max(jnp.abs(d) / jnp.where(c > 0, c, 1.0)) for d, c in pairs if jnp.size(c)]
     return jnp.max(jnp.stack(shares or [jnp.asarray(0.0)]))
 
@@ -73,7 +73,7 @@ def shortest_step(t: Array) -> Scalar:
     return jnp.maximum(MIN_STEP_EPS * number.eps * jnp.abs(t), number.tiny / number.eps)
 
 
-def spectral_step_limit(hybrid: HybridSystem, t: Array, state: State, scale: Vector) -> Scalar:
+def spectral_step_limit(hybrid: HybridSystem, t: Array, state: HybridState, scale: Vector) -> Scalar:
     """Return the stability limit of a step, 3/rho [s], with an estimate rho of the spectral radius of the flow's
     Jacobian.
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from diffabs.core.protocols import Memory, Segment
 from diffabs.core.types import PyTree, Scalar
-from diffabs.engine.hybrid import HybridSystem, Margins, Objectives, Signals, State
+from diffabs.engine.hybrid import HybridSignals, HybridState, HybridSystem, Margins, Objectives
 from diffabs.engine.step.comparisons import SwitchedProgram
 from diffabs.engine.step.modes import ComparisonAnswers, Mode, ModeBits
 from diffabs.engine.step.surfaces import SwitchingFunction
@@ -36,7 +36,7 @@ class Instant(NamedTuple):
 
     rate: PyTree
     accumulator_rates: dict[str, PyTree]
-    signals: Signals
+    signals: HybridSignals
     margins: Margins
 
 
@@ -56,7 +56,7 @@ class Evaluation(NamedTuple):
     """
 
     rates: tuple[PyTree, PyTree]
-    signals: Signals
+    signals: HybridSignals
     margins: Margins
     words: ModeBits
     contradicted: ModeBits
@@ -100,7 +100,7 @@ class ObservedSystem(NamedTuple):
             return _evaluate_rates(moving, fixed)
         return self.program(lambda dynamics: dynamics[:2], moving, fixed, mode)
 
-    def list_margins(self, t: Scalar, state: State, accumulators: Accumulators, mode: Mode) -> list[Scalar]:
+    def list_margins(self, t: Scalar, state: HybridState, accumulators: Accumulators, mode: Mode) -> list[Scalar]:
         """Return the margins of comparisons and then of events at time `t`, `state` and `accumulators` in a `mode`."""
         z, held = split_flow_and_held(state, accumulators)
         moving, fixed = (t, *z), (held, self.hybrid, self.objectives)
@@ -112,7 +112,7 @@ class ObservedSystem(NamedTuple):
         )
         return [margin for _, margin in answers.margins] + jax.tree.leaves(margins)
 
-    def evaluate(self, t: Scalar, state: State, accumulators: Accumulators, mode: Mode) -> Evaluation:
+    def evaluate(self, t: Scalar, state: HybridState, accumulators: Accumulators, mode: Mode) -> Evaluation:
         """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`."""
         z, held = split_flow_and_held(state, accumulators)
         fixed = (held, self.hybrid, self.objectives)
@@ -125,7 +125,7 @@ class ObservedSystem(NamedTuple):
         def moving_signals(t: Scalar, z: object) -> tuple[PyTree, ComparisonAnswers]:
             dynamics, answers = look(t, z)
             sample = dynamics.signals.sample
-            shown = {"sample": sample, "shown": sample.shown(), "": ()}[self.signal_rates]
+            shown = {"sample": sample, "shown": sample.show(), "": ()}[self.signal_rates]
             margins = (
                 (dynamics.margins, [margin for _, margin in answers.margins]) if self.has_margin_rates else ((), [])
             )
@@ -152,7 +152,7 @@ def build_system(
     hybrid: HybridSystem,
     objectives: Objectives,
     t: Scalar,
-    state: State,
+    state: HybridState,
     accumulators: Accumulators,
     *,
     switched: bool,
@@ -184,7 +184,13 @@ def trace_program(moving: PyTree, fixed: PyTree) -> SwitchedProgram:
 
 
 def _find_asked_rates(
-    hybrid: HybridSystem, objectives: Objectives, t: Scalar, state: State, accumulators: Accumulators, *, smooth: bool
+    hybrid: HybridSystem,
+    objectives: Objectives,
+    t: Scalar,
+    state: HybridState,
+    accumulators: Accumulators,
+    *,
+    smooth: bool,
 ) -> str:
     """Return the signals of a segment whose rates the objectives ask for, as `ObservedSystem.signal_rates`."""
     needed = set()
@@ -194,12 +200,12 @@ def _find_asked_rates(
         return rates, rates
 
     def update(
-        hybrid: HybridSystem, objectives: Objectives, state: State, accumulators: Accumulators, t: Scalar
+        hybrid: HybridSystem, objectives: Objectives, state: HybridState, accumulators: Accumulators, t: Scalar
     ) -> PyTree:
         sample = hybrid.signals(t, state).sample
         segment = Segment(
             *(sample, sample, t, t),
-            lambda: note("shown", sample.shown()),
+            lambda: note("shown", sample.show()),
             lambda: note("sample", sample),
             smooth=t > 0 if smooth else False,
         )
@@ -209,13 +215,13 @@ def _find_asked_rates(
     return "sample" if "sample" in needed else "shown" if needed else ""
 
 
-def split_flow_and_held(state: State, accumulators: Accumulators) -> tuple[PyTree, PyTree]:
+def split_flow_and_held(state: HybridState, accumulators: Accumulators) -> tuple[PyTree, PyTree]:
     """Return the integrated part of system and objectives, and the part that is constant between two instants."""
     flow = (state.flow(), {name: memory.flow for name, memory in accumulators.items()})
-    return flow, (state.held(), {name: memory.held for name, memory in accumulators.items()})
+    return flow, (state.memories(), {name: memory.held for name, memory in accumulators.items()})
 
 
-def with_flow(state: State, accumulators: Accumulators, flow: PyTree) -> tuple[State, Accumulators]:
+def with_flow(state: HybridState, accumulators: Accumulators, flow: PyTree) -> tuple[HybridState, Accumulators]:
     """Return state and accumulators with another integrated part, as `split_flow_and_held` returns it."""
     return state.with_flow(flow[0]), {
         name: memory._replace(flow=flow[1][name]) for name, memory in accumulators.items()

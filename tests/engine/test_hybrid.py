@@ -1,0 +1,147 @@
+"""Hybrid systems that are neither loop nor field: the engine needs nothing else of a system than its protocol."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffabs as d
+from diffabs.core.pytree import param, pytree
+from diffabs.engine.drive.runs import run_system
+
+A = np.array([[0.9, 0.2], [-0.3, 0.8]])
+
+
+class Numbers(NamedTuple):
+    """A state, and its only signal."""
+
+    x: Any = ()
+    steps: Any = ()
+
+    def flow(self):
+        return self.x
+
+    def memories(self):
+        return self.steps
+
+    def with_flow(self, flow):
+        return self._replace(x=flow)
+
+    def show(self):
+        return self
+
+    def error_signals(self):
+        return ()
+
+    signal_scales = error_signals
+
+
+class Signals(NamedTuple):
+    sample: Any
+    recorded: Any
+
+
+class System:
+    """What both systems below have in common: no events, no clock, nothing to prepare or to project."""
+
+    changes = ticks = eventful = jumps = False
+    recorders = ()
+
+    def prepare_run(self):
+        return self, {}
+
+    def join_state(self, flow, held):
+        return Numbers(flow, held)
+
+    def signals(self, t, state):
+        return Signals(state, {})
+
+    def flow(self, t, state, signals):
+        return ()
+
+    def margins(self, t, state, signals, flow):
+        return {"stop": (jnp.ones_like(t),)}
+
+    def project(self, state):
+        return state
+
+    def error_signals(self, state):
+        return ()
+
+
+@pytree
+class Difference(System):
+    """x(k + 1) = A x(k), by a clock, without a flow."""
+
+    matrix: Any = param(default=A, unit="1", free=True)
+
+    changes = ticks = True
+
+    def start(self):
+        return Numbers((), jnp.array([1.0, 0.0]))
+
+    def change(self, clock, state, before, margins, fired, passed=None):
+        return state._replace(steps=jnp.where(clock.k > 0, self.matrix @ state.steps, state.steps))
+
+    def next_tick(self, k, h):
+        return k + 1
+
+
+@pytree
+class Ball(System):
+    """y'' = -g; at y = 0 the speed turns to -e y'. It stops at a time of its own."""
+
+    gravity: Any = param(default=9.81, unit="m/s^2")
+    bounce: Any = param(default=0.8, unit="1")
+
+    changes = eventful = True
+
+    def start(self):
+        return Numbers((jnp.asarray(1.0), jnp.asarray(0.0)), jnp.asarray(0.0))
+
+    def flow(self, t, state, signals):
+        return (state.x[1], -self.gravity)
+
+    def margins(self, t, state, signals, flow):
+        return {"stop": (1.0 - t,), "ground": (jnp.where(state.x[1] < 0, state.x[0], 1.0),)}
+
+    def change(self, clock, state, before, margins, fired, passed=None):
+        (height, speed), hits = state.x, fired["ground"][0]
+        return Numbers((height, jnp.where(hits, -self.bounce * speed, speed)), state.steps + hits)
+
+
+def last_state(system, objectives, carry):
+    return carry.point.state, None
+
+
+@pytest.mark.parametrize("solver", [d.FixedStep(0.5, 10.0), d.Adaptive(1e-6, 10.0, step=0.5)])
+def test_a_difference_equation_has_a_clock_and_no_flow(solver):
+    """Of 20 instants after t = 0 the last one ends the run, and changes nothing."""
+
+    def end(matrix):
+        return run_system(Difference(matrix=matrix), solver, last_state).steps
+
+    np.testing.assert_allclose(end(jnp.asarray(A)), np.linalg.matrix_power(A, 19) @ [1.0, 0.0], rtol=1e-12)
+    slope = jax.jvp(end, (jnp.asarray(A),), (jnp.eye(2),))[1]
+    exact = 19 * np.linalg.matrix_power(A, 18) @ [1.0, 0.0]  # d (A + s I)^19/ds
+    np.testing.assert_allclose(slope, exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize("solver", [d.FixedStep(0.01, 2.0), d.Adaptive(1e-8, 2.0)])
+def test_a_ball_bounces_and_has_derivatives(solver):
+    """In closed form: it lands at sqrt(2/g) with sqrt(2 g), and rises with e sqrt(2 g) up to t = 1."""
+
+    def height(gravity):
+        return run_system(Ball(gravity=gravity, bounce=jnp.asarray(0.8)), solver, last_state).x[0]
+
+    def exact(g):
+        after = 1.0 - np.sqrt(2 / g)
+        return 0.8 * np.sqrt(2 * g) * after - 0.5 * g * after**2
+
+    g = jnp.asarray(9.81)
+    np.testing.assert_allclose(height(g), exact(9.81), rtol=1e-7)
+    slope = (exact(9.81 + 1e-6) - exact(9.81 - 1e-6)) / 2e-6
+    np.testing.assert_allclose(jax.grad(height)(g), slope, rtol=1e-5)
+    np.testing.assert_allclose(jax.jvp(height, (g,), (1.0,))[1], slope, rtol=1e-5)
