@@ -10,7 +10,7 @@ import typer
 
 from diffabs import __version__
 from diffabs.cli import console, targets
-from diffabs.engine.types import FixedStep
+from diffabs.engine.solvers import FixedStep
 from diffabs.host.values import ScenarioError
 from diffabs.parts.controllers import Sampled, SampledOnGrid
 from diffabs.scenario.scenario import Scenario

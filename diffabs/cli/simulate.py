@@ -10,11 +10,11 @@ import typer
 from diffabs.cli import console, show, targets
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
-from diffabs.engine.convert import write_csv
-from diffabs.engine.matlab import write_mat
-from diffabs.engine.types import Run
 from diffabs.host import documents, provenance
 from diffabs.loop.checking import describe_check
+from diffabs.loop.convert import write_csv
+from diffabs.loop.matlab import write_mat
+from diffabs.loop.result import Run
 from diffabs.scenario.samples import load_sample
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.simulation import simulate as run_scenario

@@ -128,8 +128,8 @@ class HybridSystem(Protocol):
     ) -> Any:
         """Return the state after an instant, of the state, the signals `before` it, and its margins.
 
-        Where a run ends it is not called. `fired` is True for each margin that has fallen through zero. `passed` has the recorded signals over the step
-        that ends here; None at the start of a run.
+        Where a run ends it is not called. `fired` is True for each margin that has fallen through zero. `passed` has
+        the recorded signals over the step that ends here; None at the start of a run.
         """
         ...
 

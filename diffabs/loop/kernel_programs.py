@@ -11,13 +11,13 @@ from diffabs.compiler.listing import count_by_level
 from diffabs.compiler.lower.rules import Unsupported
 from diffabs.compiler.passes import LaneCall, find_lane_calls, list_pass
 from diffabs.compiler.runtime.toolchain import NoCompiler
-from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, get, parameters
 from diffabs.core.types import AnyArray, Array
 from diffabs.engine.drive.engine import EngineError
-from diffabs.engine.types import Solver
+from diffabs.engine.solvers import Solver
 from diffabs.loop.batch import Batch
+from diffabs.loop.closed_loop import Loop
 from diffabs.loop.ensemble import run_batch
 
 

@@ -15,7 +15,7 @@ from diffabs.core import shapes
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.numerics import invalidate, void_derivatives
 from diffabs.core.protocols import Ending, Objective, Plant, Sample
-from diffabs.core.types import AnyArray, Bool, Int, PyTree, Scalar
+from diffabs.core.types import AnyArray, Bool, PyTree, Scalar
 from diffabs.engine.step.slides import Slide, has_slid, slide_of
 from diffabs.engine.step.status import RunStatus
 from diffabs.loop import convert

@@ -8,7 +8,7 @@ import numpy as np
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject, Scalar
 from diffabs.core.units import units_of
-from diffabs.engine.types import describe_solver
+from diffabs.engine.solvers import describe_solver
 from diffabs.host import documents, provenance
 from diffabs.scenario import registry
 

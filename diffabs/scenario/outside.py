@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from diffabs.core import protocols
-from diffabs.core.loop import Loop
 from diffabs.core.types import Part, PyTree
 from diffabs.host.values import ScenarioError
+from diffabs.loop.closed_loop import Loop
 from diffabs.parts.roads.sign import find_wrong_sign
 
 ENTRY_POINT_GROUP = "diffabs.parts"

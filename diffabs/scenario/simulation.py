@@ -8,12 +8,13 @@ from typing import NamedTuple
 import jax
 
 from diffabs.core.types import JsonObject, Key
-from diffabs.engine.faults import describe_faults
-from diffabs.engine.run import measure, rollout
-from diffabs.engine.sliding import describe_slide
-from diffabs.engine.types import Adaptive, Run, Solver, describe_solver
+from diffabs.engine.solvers import Adaptive, Solver, describe_solver
 from diffabs.host.values import ScenarioError
 from diffabs.loop.checking import check_run_accuracy, describe_loose_metrics
+from diffabs.loop.faults import describe_faults
+from diffabs.loop.result import Run
+from diffabs.loop.run import measure, rollout
+from diffabs.loop.sliding import describe_slide
 from diffabs.parts.objectives import at_limits
 from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario

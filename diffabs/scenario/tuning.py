@@ -9,8 +9,8 @@ import numpy as np
 from diffabs.core.bijectors import reached_bound
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import JsonObject, Params, Part, Scalar
-from diffabs.engine.admissible import first_refusal
 from diffabs.host.values import ScenarioError
+from diffabs.loop.admissible import first_refusal
 from diffabs.scenario import proving
 from diffabs.scenario.proving import Proved
 from diffabs.scenario.scenario import Scenario

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 
 from diffabs.core.types import Part, PyTree, Scalar
-from diffabs.engine.run import rollout
-from diffabs.engine.types import Trajectory
+from diffabs.loop.result import Trajectory
+from diffabs.loop.run import rollout
 from diffabs.output.plot.style import (
     COLOURS,
     GREY,
