@@ -1,4 +1,6 @@
-"""One name has one meaning in the whole package, and a function's name is a verb or the noun that it returns."""
+"""One name has one meaning in the whole package, and a function's name is a verb or the noun that it returns.
+
+Things have the names of things in the studies too."""
 
 import ast
 import collections
@@ -11,6 +13,9 @@ from project import ROOT
 
 PACKAGE = ROOT / "diffabs"
 TREES = {path.relative_to(PACKAGE): ast.parse(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
+STUDIES = {
+    path.relative_to(ROOT): ast.parse(path.read_text("utf-8")) for path in sorted((ROOT / "experiments").rglob("*.py"))
+}
 
 # The same verb, the same meaning: a command and the function that it calls; the methods of a paper's module; a
 # formula of a checker that imports nothing of the package.
@@ -107,9 +112,10 @@ def things(tree):
 
 
 @killed_by("engine.step.slides", "    comparison: shapes", "    which: shapes")
-@pytest.mark.parametrize("path", TREES, ids=str)
+@pytest.mark.parametrize("path", TREES | STUDIES, ids=str)
 def test_a_thing_has_the_name_of_a_thing(path):
-    assert [f"{name}, line {line}" for name, line in things(TREES[path]) if name.strip("_") in FILLERS] == []
+    tree = (TREES | STUDIES)[path]
+    assert [f"{name}, line {line}" for name, line in things(tree) if name.strip("_") in FILLERS] == []
 
 
 @pytest.mark.parametrize(

@@ -46,10 +46,10 @@ class Family(NamedTuple):
     def with_paper(self, share: float) -> Batch:
         """Return these lanes, and the paper's own car and road, which has this share of the whole weight."""
         road, v, n = MagicFormula(), 100 / plot.KMH, len(self.time)
-        own = {"plant.mass": 15.0, "initial.speed": v, "plant.road.edges": [1e4]}
+        papers = {"plant.mass": 15.0, "initial.speed": v, "plant.road.edges": [1e4]}
         for i in (0, 1):
-            own |= {f"plant.road.roads.{i}.{name}": getattr(road, name) for name in ("B", "C", "D", "E")}
-        values = {path: np.concatenate([column, [own[path]]]) for path, column in self.values.items()}
+            papers |= {f"plant.road.roads.{i}.{name}": getattr(road, name) for name in ("B", "C", "D", "E")}
+        values = {path: np.concatenate([column, [papers[path]]]) for path, column in self.values.items()}
         distance, time = v**2 / (2 * GRAVITY * road.D), v / (GRAVITY * road.D)
         weights = np.concatenate([(1 - share) / n / self.distance, [share / distance]]) * (n + 1)
         return Batch(values, weights=weights, durations=1.3 * np.append(self.time, time) + 1.0)

@@ -65,11 +65,11 @@ def _noise(bounds: Bounds, slopes: np.ndarray) -> np.ndarray:
 
 def along(bounds: Bounds, slopes: np.ndarray) -> np.ndarray:
     """Return gradients whose root mean square is one in each block, or 0 (n, size)."""
-    found = np.zeros_like(slopes)
+    units = np.zeros_like(slopes)
     for block in bounds.blocks:
         norm = np.sqrt(np.mean(slopes[:, block] ** 2, axis=1, keepdims=True))
-        found[:, block] = np.divide(slopes[:, block], norm, out=np.zeros_like(slopes[:, block]), where=norm > 0)
-    return found
+        units[:, block] = np.divide(slopes[:, block], norm, out=np.zeros_like(slopes[:, block]), where=norm > 0)
+    return units
 
 
 def tries(

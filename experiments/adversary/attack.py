@@ -52,13 +52,13 @@ class Attack:
         size = min(self.running.block, 1 << (count - 1).bit_length())
         padded = np.concatenate([z, np.repeat(z[-1:], -count % size, axis=0)])
         runs = [self.runs(part) for part in np.split(padded, len(padded) // size)]
-        found = [np.where(run.stopped & ~run.diverged, run.metrics["overshoot"], NOTHING) for run in runs]
-        return np.concatenate(found)[:count]
+        overshoots = [np.where(run.stopped & ~run.diverged, run.metrics["overshoot"], NOTHING) for run in runs]
+        return np.concatenate(overshoots)[:count]
 
     def gradients(self, z: np.ndarray) -> np.ndarray:
         """Return the derivatives of the overshoots (n, size), by reverse mode; 0 where one is no number."""
-        found = _slopes(jnp.asarray(z), self.loop, self.bounds, self.solver())
-        return np.nan_to_num(np.asarray(found), posinf=0.0, neginf=0.0)
+        slopes = _slopes(jnp.asarray(z), self.loop, self.bounds, self.solver())
+        return np.nan_to_num(np.asarray(slopes), posinf=0.0, neginf=0.0)
 
     def priced(self, gradients: int, runs: int) -> float:
         """Return how many runs a gradient costs, where so many of either are asked for at once: processor time, taken

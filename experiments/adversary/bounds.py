@@ -66,10 +66,10 @@ def feasible(bounds: Bounds, z: np.ndarray) -> np.ndarray:
 
 
 def _limited(z: np.ndarray, steepest: float) -> np.ndarray:
-    found = z.copy()
+    limited = z.copy()
     for i in range(1, z.shape[1]):
-        found[:, i] = found[:, i - 1] + np.clip(z[:, i] - found[:, i - 1], -steepest, steepest)
-    return found
+        limited[:, i] = limited[:, i - 1] + np.clip(z[:, i] - limited[:, i - 1], -steepest, steepest)
+    return limited
 
 
 def parameters(bounds: Bounds, z: Any) -> dict[str, Any]:

@@ -28,17 +28,16 @@ def by_block(attack: Attack, z: np.ndarray) -> dict[str, float]:
     for i, block in enumerate(attack.bounds.blocks):
         points[1 + i, block] = z[0, block]
     points[4] = z[0]
-    found = 100 * attack.overshoots(points)
+    overshoots = 100 * attack.overshoots(points)
     names = ("road alone", "noise alone", "start alone", "together")
-    return {name: float(value - found[0]) for name, value in zip(names, found[1:], strict=True)}
+    return {name: float(value - overshoots[0]) for name, value in zip(names, overshoots[1:], strict=True)}
 
 
 def with_shorter_steps(attack: Attack, z: np.ndarray) -> dict[str, float]:
     """Return the overshoot [%] at a point (1, size), and its change if the step is halved, and halved again."""
-    found = [float(attack.runs(z, finer).metrics["overshoot"][0]) for finer in (1, 2, 4)]
-    return {"overshoot [%]": 100 * found[0], "step halved": 100 * (found[1] - found[0]), "quartered": 100 * (
-        found[2] - found[0]
-    )}  # fmt: skip
+    overshoot, halved, quartered = (float(attack.runs(z, finer).metrics["overshoot"][0]) for finer in (1, 2, 4))
+    changes = {"step halved": 100 * (halved - overshoot), "quartered": 100 * (quartered - overshoot)}
+    return {"overshoot [%]": 100 * overshoot, **changes}
 
 
 def against_differences(attack: Attack, z: np.ndarray, entries: np.ndarray) -> list[dict[str, float]]:
@@ -46,11 +45,11 @@ def against_differences(attack: Attack, z: np.ndarray, entries: np.ndarray) -> l
     not be in the set."""
     slope, rows = attack.gradients(z)[0], []
     moved = np.concatenate([z + w * s * np.eye(z.shape[1])[entries] for w in WIDTHS for s in (1, -1)])
-    found = attack.overshoots(moved).reshape(len(WIDTHS), 2, -1)
+    overshoots = attack.overshoots(moved).reshape(len(WIDTHS), 2, -1)
     for i, entry in enumerate(entries):
         row = {"number": float(entry), "gradient": float(slope[entry])}
         for k, width in enumerate(WIDTHS):
-            row[f"width {width:g}"] = float((found[k, 0, i] - found[k, 1, i]) / (2 * width))
+            row[f"width {width:g}"] = float((overshoots[k, 0, i] - overshoots[k, 1, i]) / (2 * width))
         rows.append(row)
     return rows
 
@@ -59,12 +58,12 @@ def elsewhere(loop: Loop, attack: Attack, z: np.ndarray) -> float:
     """Overshoot [1] at a point (1, size), by SciPy. The controller is a ProportionalFeedback with back-calculation, its
     target a LimitedSlip."""
     values = {path: np.asarray(value)[0] for path, value in parameters(attack.bounds, z).items()}
-    one: Any = replace(loop, values)
-    rates, slip_of = _plant(one, values[ROAD])
-    computer, noise = _Computer(one), values[NOISE]
-    h, radius, stop = float(one.controller.sampling_period), float(one.plant.body_radius), float(one.stop.speed)
+    case: Any = replace(loop, values)
+    rates, slip_of = _plant(case, values[ROAD])
+    computer, noise = _Computer(case), values[NOISE]
+    h, radius, stop = float(case.controller.sampling_period), float(case.plant.body_radius), float(case.stop.speed)
     speed = float(values["initial.speed"])
-    x, greatest = np.array([speed / float(one.plant.wheel_radius), speed / radius, 0.0, 0.0]), 0.0
+    x, greatest = np.array([speed / float(case.plant.wheel_radius), speed / radius, 0.0, 0.0]), 0.0
 
     def ended(t: float, x: np.ndarray, u: float) -> float:
         del t, u
@@ -76,19 +75,19 @@ def elsewhere(loop: Loop, attack: Attack, z: np.ndarray) -> float:
         part = solve_ivp(
             rates, (k * h, (k + 1) * h), x, "DOP853", args=(u,), events=ended, rtol=1e-10, atol=1e-12, dense_output=True
         )
-        seen = part.sol(np.linspace(part.t[0], part.t[-1], DENSE + 1))
-        greatest, x = max(greatest, max(slip_of(at) for at in seen.T)), part.y[:, -1]
+        states = part.sol(np.linspace(part.t[0], part.t[-1], DENSE + 1))
+        greatest, x = max(greatest, max(slip_of(at) for at in states.T)), part.y[:, -1]
         if part.status == 1:
-            return greatest / float(one.reference.slip) - 1
+            return greatest / float(case.reference.slip) - 1
     raise RuntimeError("the run did not end")
 
 
-def _plant(one: Any, factors: np.ndarray) -> tuple[Any, Any]:
+def _plant(loop: Any, factors: np.ndarray) -> tuple[Any, Any]:
     """Rates of (wheel, body, torque, distance) under a command, and the slip."""
-    p, road, spacing = one.plant, one.plant.road.road, float(one.plant.road.spacing)
+    p, road, spacing = loop.plant, loop.plant.road.road, float(loop.plant.road.spacing)
     w1, w2, w3, w4, a, q = (float(getattr(road, name)) for name in ("w1", "w2", "w3", "w4", "a", "q"))
     mass, inertia, share = float(p.mass), float(p.wheel_inertia), float(p.inertia_factor)
-    r1, r2, lag = float(p.wheel_radius), float(p.body_radius), float(one.actuator.time_constant)
+    r1, r2, lag = float(p.wheel_radius), float(p.body_radius), float(loop.actuator.time_constant)
     padded = np.concatenate([3 * [factors[0]], factors, 3 * [factors[-1]]])
     spline = BSpline(spacing * np.arange(-5, len(factors) + 5.0), padded, 3)
 
@@ -109,21 +108,21 @@ def _plant(one: Any, factors: np.ndarray) -> tuple[Any, Any]:
 class _Computer:
     """Target, controller and anti-windup of one period."""
 
-    def __init__(self, one: Any):
+    def __init__(self, loop: Any):
         """From their parameters."""
-        self.one, self.control, self.target, self.integral = one, one.controller.controller, 0.0, 0.0
+        self.loop, self.control, self.target, self.integral = loop, loop.controller.controller, 0.0, 0.0
 
     def step(self, slip: float, speed: float) -> float:
         """Return the commanded torque for the measured slip and speed."""
-        one, c = self.one, self.control
-        h = float(one.reference.period)
-        scaled = h * float(one.reference.reference_speed) / speed
-        left = float(one.reference.slip) - self.target
+        loop, c = self.loop, self.control
+        h = float(loop.reference.period)
+        scaled = h * float(loop.reference.reference_speed) / speed
+        gap = float(loop.reference.slip) - self.target
         self.target += min(
-            -math.expm1(-scaled / float(one.reference.time_constant)) * left, scaled * float(one.reference.rate)
+            -math.expm1(-scaled / float(loop.reference.time_constant)) * gap, scaled * float(loop.reference.rate)
         )
         k1, k2 = (speed / float(c.reference_speed) * float(k) for k in c.gain)
-        raw = float(one.feedforward.value) + k1 * self.integral + k2 * (slip - self.target)
+        raw = float(loop.feedforward.value) + k1 * self.integral + k2 * (slip - self.target)
         u = min(max(raw, float(c.low)), float(c.high))
         self.integral += h * (slip - self.target + (u - raw) / (k1 * float(c.antiwindup.tracking_time)))
         return u

@@ -14,10 +14,12 @@ from experiments.adversary.search import Log
 KMH = 3.6
 
 
-def cost_figure(found: Mapping[str, Mapping[str, Log]], nominals: Mapping[str, float], budget: int) -> Any:
+def cost_figure(logs_by_loop: Mapping[str, Mapping[str, Log]], nominals: Mapping[str, float], budget: int) -> Any:
     """Excess over the cost, of each search of each controller: medians, and from the least to the greatest seed."""
-    figure, axes = plot.sheet(2, -(-len(found) // 2), title="Excess overshoot found, over its cost", size=(4.4, 3.2))
-    for ax, (name, logs) in zip(axes, found.items(), strict=False):
+    figure, axes = plot.sheet(
+        2, -(-len(logs_by_loop) // 2), title="Excess overshoot found, over its cost", size=(4.4, 3.2)
+    )
+    for ax, (name, logs) in zip(axes, logs_by_loop.items(), strict=False):
         for i, (search, log) in enumerate(logs.items()):
             cost = np.array([spent for spent, _ in log.history])
             excess = 100 * (np.array([values for _, values in log.history]) - nominals[name])
@@ -32,7 +34,7 @@ def cost_figure(found: Mapping[str, Mapping[str, Log]], nominals: Mapping[str, f
         ax.set_ylim(bottom=0)
         plot.label_axes(ax, "cost [runs]", "excess overshoot [%]", name, legend=False)
         ax.legend(loc="lower right", fontsize=9.5, framealpha=0.9, edgecolor="none")
-    for ax in axes[len(found) :]:
+    for ax in axes[len(logs_by_loop) :]:
         ax.set_visible(False)
     return figure
 
@@ -59,11 +61,11 @@ def road_figure(attacks: Mapping[str, Attack], worst: Mapping[str, np.ndarray], 
 
 
 def _drawn(axes: Any, attack: Attack, values: dict[str, Any], style: dict[str, Any]) -> None:
-    one: Any = replace(attack.loop, values)
-    run = rollout(one, attack.solver())
+    loop: Any = replace(attack.loop, values)
+    run = rollout(loop, attack.solver())
     sample, running = run.trajectory.sample, np.asarray(run.trajectory.running)  # pyright: ignore[reportOptionalMemberAccess]
     last = int(running.sum())
     x = np.linspace(0.0, float(sample.output.distance[last - 1]), 400)
-    axes[0].plot(x, [float(one.plant.road.factor(at)) for at in x], **style)
+    axes[0].plot(x, [float(loop.plant.road.factor(at)) for at in x], **style)
     axes[1].step(np.arange(len(values[NOISE])), values[NOISE], where="post", **style)
     axes[2].plot(np.asarray(sample.t)[:last], np.asarray(sample.output.slip)[:last], **style)

@@ -37,11 +37,11 @@ TUNED = "tuned in the box"
 
 def attacked(bounds: Bounds, fixed: Fixed, controller: Any, reference: Any = None) -> Loop:
     """Return the loop around a controller, on an even road and without noise until the adversary has chosen."""
-    one = loop(fixed, controller, KNOWN, reference)
-    road = ScaledAlong(road=one.plant.road, factors=np.ones(bounds.factors), spacing=bounds.spacing)  # pyright: ignore[reportAttributeAccessIssue]
+    ideal = loop(fixed, controller, KNOWN, reference)
+    road = ScaledAlong(road=ideal.plant.road, factors=np.ones(bounds.factors), spacing=bounds.spacing)  # pyright: ignore[reportAttributeAccessIssue]
     noise = PlayedWheelNoise(noise=np.zeros(bounds.noises), period=fixed.period)
     return dataclasses.replace(
-        one, plant=dataclasses.replace(one.plant, road=road), sensor=Series(blocks=(noise, DriftingSpeed()))
+        ideal, plant=dataclasses.replace(ideal.plant, road=road), sensor=Series(blocks=(noise, DriftingSpeed()))
     )
 
 

@@ -65,9 +65,9 @@ def hardened(
     for number in range(1, config.rounds + 1):
         now = dataclasses.replace(attack, loop=loops[-1])
         seeds = tuple(number * 1000 + seed for seed in config.seeds)
-        found = attacked(now, searching, seeds, config.budget, price).points
-        lanes[config.box + count : config.box + count + len(found)] = found
-        count += len(found)
+        points = attacked(now, searching, seeds, config.budget, price).points
+        lanes[config.box + count : config.box + count + len(points)] = points
+        count += len(points)
         loops.append(_tuned(loops[-1], bounds, config, attack, lanes))
         report(f"round {number}: {_said(loops[-1])}")
     return loops, lanes[config.box : config.box + count]
@@ -75,7 +75,7 @@ def hardened(
 
 def _tuned(loop: Loop, bounds: Bounds, config: Rounds, attack: Attack, lanes: np.ndarray) -> Loop:
     names = tuple(config.weights)
-    found = tune(
+    tuning = tune(
         build_problem(
             loop,
             free=config.free,
@@ -88,27 +88,27 @@ def _tuned(loop: Loop, bounds: Bounds, config: Rounds, attack: Attack, lanes: np
         ),
         method=Method(stopping=Stopping(change=1e-4, iterations=config.iterations)),
     )
-    return found.part
+    return tuning.part
 
 
 def _said(loop: Loop) -> str:
-    one: Any = loop
-    gain = ", ".join(f"{k:.0f}" for k in np.asarray(one.controller.controller.gain))
-    tracking = float(one.controller.controller.antiwindup.tracking_time)
+    parts: Any = loop
+    gain = ", ".join(f"{k:.0f}" for k in np.asarray(parts.controller.controller.gain))
+    tracking = float(parts.controller.controller.antiwindup.tracking_time)
     return (
-        f"gain {gain}, tracking {tracking:.4f} s, rate {float(one.reference.rate):.2f} /s, "
-        f"time constant {float(one.reference.time_constant):.4f} s"
+        f"gain {gain}, tracking {tracking:.4f} s, rate {float(parts.reference.rate):.2f} /s, "
+        f"time constant {float(parts.reference.time_constant):.4f} s"
     )
 
 
 def judged(attack: Attack, config: Rounds, searching: Searching, price: float) -> dict[str, Any]:
     """Return how a loop fares against fresh adversaries, and on random points. A run that diverges or does not stop
     is counted, and in no mean."""
-    found = attacked(attack, searching, config.fresh, config.budget, price)
+    log = attacked(attack, searching, config.fresh, config.budget, price)
     points = drawn(attack.bounds, config.samples, np.random.default_rng(config.seed + 1))
-    both = found.overshoots, attack.overshoots(points)
+    both = log.overshoots, attack.overshoots(points)
     fresh, random = (kept(each, each > NOTHING) for each in both)
-    error, errors = (attack.runs(z).metrics["iae"] for z in (nominal(attack.bounds), found.points))
+    error, errors = (attack.runs(z).metrics["iae"] for z in (nominal(attack.bounds), log.points))
     return {
         "nominal [%]": 100 * float(attack.overshoots(nominal(attack.bounds))[0]),
         "fresh adversaries, median [%]": 100 * float(np.median(fresh)),
@@ -119,7 +119,7 @@ def judged(attack: Attack, config: Rounds, searching: Searching, price: float) -
         "random, greatest [%]": 100 * float(random.max()),
         "not stopped or diverged": sum(int(np.sum(each <= NOTHING)) for each in both),
         "IAE, nominal [s]": float(error[0]),
-        "IAE, greatest found [s]": float(np.max(kept(errors, found.overshoots > NOTHING))),
+        "IAE, greatest found [s]": float(np.max(kept(errors, log.overshoots > NOTHING))),
         **in_the_box(attack.loop, config),
     }
 
@@ -127,9 +127,9 @@ def judged(attack: Attack, config: Rounds, searching: Searching, price: float) -
 def in_the_box(loop: Loop, config: Rounds) -> dict[str, float]:
     """Return overshoots of the same gains in the box of `real_rig`, with every error at once. A run that diverges
     counts as LOST."""
-    one: Any = loop
-    judged = loop_of_box(Fixed(), one.controller.controller, KNOWN, one.reference)
+    parts: Any = loop
+    judged = loop_of_box(Fixed(), parts.controller.controller, KNOWN, parts.reference)
     points = drawn_from_box(Box(), KNOWN, config.samples, config.seed + 2)
-    found = 100 * runs(judged, points, Judging(), config.seed + 2)["overshoot"]
+    overshoots = 100 * runs(judged, points, Judging(), config.seed + 2)["overshoot"]
     quantiles = {"median": 0.5, "95 %": 0.95, "greatest": 1.0}
-    return {f"box, {name} [%]": float(np.quantile(found, level)) for name, level in quantiles.items()}
+    return {f"box, {name} [%]": float(np.quantile(overshoots, level)) for name, level in quantiles.items()}

@@ -72,13 +72,13 @@ def excesses(config: Config, logs: dict[str, Log], at_rest: float) -> list[dict[
 
     The excess is a median, least and greatest over the seeds.
     """
-    most = max(log.overshoots.max() for log in logs.values())
-    near, rows = at_rest + NEAR * (most - at_rest), []
+    greatest = max(log.overshoots.max() for log in logs.values())
+    near, rows = at_rest + NEAR * (greatest - at_rest), []
     for name, log in logs.items():
         row: dict[str, Any] = {"search": name}
         for mark in config.marks:
-            found = 100 * (log.at(mark) - at_rest)
-            row[f"{mark} runs"] = f"{np.median(found):.2f} ({found.min():.2f}-{found.max():.2f})"
+            excess = 100 * (log.at(mark) - at_rest)
+            row[f"{mark} runs"] = f"{np.median(excess):.2f} ({excess.min():.2f}-{excess.max():.2f})"
         cost = log.cost_of(near)
         row["runs to 95 %, median"] = _whole(float(np.median(cost)))
         row["seeds there"] = int(np.isfinite(cost).sum())
@@ -92,7 +92,7 @@ def _whole(cost: float) -> str:
 
 def _curve(log: Log, at_rest: float) -> list[list[float]]:
     """Return the costs at which the excess [%] of a seed changes, and the excesses."""
-    rows = [[spent, *(100 * (found - at_rest)).tolist()] for spent, found in log.history]
+    rows = [[spent, *(100 * (overshoots - at_rest)).tolist()] for spent, overshoots in log.history]
     return [row for i, row in enumerate(rows) if not i or row[1:] != rows[i - 1][1:]]
 
 
@@ -164,8 +164,8 @@ def tuned_against(attack: Attack, config: Config, price: float, report: Callable
     record.print_rows("Tuned against the adversary", rows)
     last: Any = loops[-1]
     c, r = last.controller.controller, last.reference
-    found = {"gain": np.asarray(c.gain).tolist(), "tracking_time": float(c.antiwindup.tracking_time)}
-    return {"table": rows, "found": found | {"rate": float(r.rate), "time_constant": float(r.time_constant)}}
+    values = {"gain": np.asarray(c.gain).tolist(), "tracking_time": float(c.antiwindup.tracking_time)}
+    return {"table": rows, "found": values | {"rate": float(r.rate), "time_constant": float(r.time_constant)}}
 
 
 def main(config: Config | None = None, progress: Callable[[str], None] | None = None) -> dict[str, Any]:
@@ -174,10 +174,10 @@ def main(config: Config | None = None, progress: Callable[[str], None] | None = 
     those = contenders(config.bounds, config.fixed)
     names = config.controllers or tuple(those)
     attacks = {name: Attack(those[name], config.bounds, config.running) for name in names}
-    found, results = {}, {}
+    logs_by_loop, results = {}, {}
     for name, attack in attacks.items():
-        found[name], results[name] = against(name, attack, config, told)
-    worst = {name: worst_of(logs, GRADIENTS) for name, logs in found.items()}
+        logs_by_loop[name], results[name] = against(name, attack, config, told)
+    worst = {name: worst_of(logs, GRADIENTS) for name, logs in logs_by_loop.items()}
     scipy = {
         name: {
             "here [%]": results[name]["worst found"]["shorter steps"]["overshoot [%]"],
@@ -192,9 +192,9 @@ def main(config: Config | None = None, progress: Callable[[str], None] | None = 
     tuning = (
         tuned_against(attacks[TUNED], config, results[TUNED]["price of a gradient"], told) if TUNED in names else {}
     )
-    nominals = {name: one["nominal overshoot [%]"] / 100 for name, one in results.items()}
+    nominals = {name: result["nominal overshoot [%]"] / 100 for name, result in results.items()}
     figures = {
-        "cost": cost_figure(found, nominals, config.searching.budget),
+        "cost": cost_figure(logs_by_loop, nominals, config.searching.budget),
         "road": road_figure({n: attacks[n] for n in config.drawn if n in names}, worst, seed=1),
     }
     pathlib.Path(config.out).mkdir(parents=True, exist_ok=True)

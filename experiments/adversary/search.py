@@ -29,7 +29,7 @@ class Searching:
     tried: tuple[float, ...] = (4.0, 1.0, 0.25, 0.06)  # times the last step
     shares: tuple[float, ...] = (1.0, 0.5, 0.2, 0.05)  # of the way to the farthest point along the gradient
     shorter: float = 0.1  # the next step, where no point was better
-    least: float = 1e-3  # step with which a start is given up for another
+    least_step: float = 1e-3  # step with which a start is given up for another
     enough: float = 1e-6  # of overshoot, gained by a gradient, or a start is given up
     spread: float = 1.0  # first deviation of CMA-ES
 
@@ -59,13 +59,15 @@ class Log:
 
     def at(self, cost: float) -> np.ndarray:
         """Return the greatest overshoots (seeds,) up to this cost; -inf before the first count."""
-        return next((found for spent, found in reversed(self.history) if spent <= cost), 0 * self.overshoots - np.inf)
+        return next(
+            (overshoots for spent, overshoots in reversed(self.history) if spent <= cost), 0 * self.overshoots - np.inf
+        )
 
     def cost_of(self, overshoot: float) -> np.ndarray:
         """Return the cost at which each search reached this overshoot (seeds,); inf for a search that did not."""
-        costs, found = np.array([s for s, _ in self.history]), np.array([o for _, o in self.history])
-        there = found >= overshoot
-        return np.where(there.any(axis=0), costs[there.argmax(axis=0)], np.inf)
+        costs, overshoots = np.array([s for s, _ in self.history]), np.array([o for _, o in self.history])
+        reached = overshoots >= overshoot
+        return np.where(reached.any(axis=0), costs[reached.argmax(axis=0)], np.inf)
 
 
 def _log(config: Searching, bounds: Bounds) -> Log:
@@ -101,9 +103,9 @@ def at_corners(attack: Attack, config: Searching, price: float) -> Log:
 def _screened(attack: Attack, config: Searching, log: Log) -> np.ndarray:
     """Random points of each search, the worst of them first (seeds, n, size)."""
     z = np.stack([drawn(attack.bounds, config.screened, np.random.default_rng([seed, 1])) for seed in config.seeds])
-    found = _asked(attack, z)
-    log.add(config.screened, z, found)
-    return np.take_along_axis(z, np.argsort(-found, axis=1)[:, :, None], axis=1)
+    overshoots = _asked(attack, z)
+    log.add(config.screened, z, overshoots)
+    return np.take_along_axis(z, np.argsort(-overshoots, axis=1)[:, :, None], axis=1)
 
 
 def cma_es(attack: Attack, config: Searching, price: float, starts: int | None = None) -> Log:
@@ -123,12 +125,14 @@ def cma_es(attack: Attack, config: Searching, price: float, starts: int | None =
 
     searches = [[begun(seed, start) for start in range(starts)] for seed in range(seeds)]
     while log.spent < config.budget:
-        asked = np.array([[search.ask() for search in row] for row in searches])  # (seeds, starts, population, size)
-        z = feasible(attack.bounds, asked.reshape(-1, size)).reshape(seeds, -1, size)
-        found = _asked(attack, z)
-        log.add(found.shape[1], z, found)
-        for (i, j), values in zip(np.ndindex(seeds, starts), found.reshape(seeds * starts, -1), strict=True):
-            searches[i][j].tell(list(asked[i, j]), list(-values))
+        populations = np.array(
+            [[search.ask() for search in row] for row in searches]
+        )  # (seeds, starts, population, size)
+        z = feasible(attack.bounds, populations.reshape(-1, size)).reshape(seeds, -1, size)
+        overshoots = _asked(attack, z)
+        log.add(overshoots.shape[1], z, overshoots)
+        for (i, j), values in zip(np.ndindex(seeds, starts), overshoots.reshape(seeds * starts, -1), strict=True):
+            searches[i][j].tell(list(populations[i, j]), list(-values))
             if searches[i][j].stop():
                 searches[i][j] = begun(i, taken[i])
                 taken[i] += 1
@@ -148,18 +152,18 @@ def gradients(attack: Attack, config: Searching, price: float) -> Log:
         flat = z.reshape(-1, size)
         lengths = step.reshape(-1, 1) * np.array(config.tried)
         points = tries(bounds, flat, attack.gradients(flat), lengths, config.shares).reshape(*z.shape[:2], -1, size)
-        found = _asked(attack, points.reshape(seeds, -1, size)).reshape(points.shape[:3])
-        log.add(cost, points.reshape(seeds, -1, size), found.reshape(seeds, -1))
-        best = found.argmax(axis=2)
+        overshoots = _asked(attack, points.reshape(seeds, -1, size)).reshape(points.shape[:3])
+        log.add(cost, points.reshape(seeds, -1, size), overshoots.reshape(seeds, -1))
+        best = overshoots.argmax(axis=2)
         for i, j in np.ndindex(*best.shape):
             k = best[i, j]
-            gained = found[i, j, k] - value[i, j]
+            gained = overshoots[i, j, k] - value[i, j]
             if gained > 0:
-                z[i, j], value[i, j] = points[i, j, k], found[i, j, k]
+                z[i, j], value[i, j] = points[i, j, k], overshoots[i, j, k]
                 step[i, j] *= config.tried[k] if k < len(config.tried) else 1.0
             else:
                 step[i, j] *= config.shorter
-            if step[i, j] < config.least or gained < config.enough:
+            if step[i, j] < config.least_step or gained < config.enough:
                 z[i, j], value[i, j], step[i, j] = queue[i, taken[i] % waiting], -np.inf, config.first
                 taken[i] += 1
     return log

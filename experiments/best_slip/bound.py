@@ -61,14 +61,14 @@ def bound(values: Mapping[str, Any], torque: float, width: float) -> Bound:
     mass, v0 = np.asarray(values["plant.mass"]), np.asarray(values["initial.speed"])
     edge = np.asarray(values["plant.road.edges"])[:, 0]
     way = whole_torque(first, peaks[0], mass, v0, torque)
-    one = np.all([first[n] == second[n] for n in "BCDE"], axis=0)
+    uniform = np.all([first[n] == second[n] for n in "BCDE"], axis=0)
     alone = way.places[-1] + way.speeds[-1] ** 2 / (2 * GRAVITY * way.friction)
     before = edge - width / 2
     v = np.maximum(speed_at(way, before) ** 2 - GRAVITY * (first["D"] + second["D"]) * width, 0.0)
     mixed = before + width + v / (2 * GRAVITY * second["D"])
     later = np.maximum(v0**2 - 2 * GRAVITY * first["D"] * edge, 0.0)
-    friction = np.where(one, v0**2 / (2 * GRAVITY * first["D"]), edge + later / (2 * GRAVITY * second["D"]))
-    return Bound(np.where(one, alone, mixed), friction, (peaks[0], peaks[1]), one, way.weak)
+    friction = np.where(uniform, v0**2 / (2 * GRAVITY * first["D"]), edge + later / (2 * GRAVITY * second["D"]))
+    return Bound(np.where(uniform, alone, mixed), friction, (peaks[0], peaks[1]), uniform, way.weak)
 
 
 def mu(surface: Mapping[str, Any], slip: Any) -> Any:

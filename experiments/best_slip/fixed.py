@@ -70,18 +70,18 @@ def lanes(fixed: Fixed, count: int, seed: int) -> Lanes:
     return Lanes(roads, bias, keys, bound(roads.values, fixed.torque, fixed.roads.width))
 
 
-def good(found: dict[str, Any]) -> np.ndarray:
+def good(result: dict[str, Any]) -> np.ndarray:
     """Lanes that stop, do not diverge and never lock (lanes,)."""
-    return found["stopped"] & ~found["diverged"] & ~(found["locked_time"] > 0)
+    return result["stopped"] & ~result["diverged"] & ~(result["locked_time"] > 0)
 
 
-def line(fixed: Fixed, found: dict[str, Any], paper: dict[str, Any], shortest: np.ndarray) -> dict[str, Any]:
+def line(fixed: Fixed, result: dict[str, Any], paper: dict[str, Any], shortest: np.ndarray) -> dict[str, Any]:
     """Return a rule's row beside the paper's rule, in per cent of the bound (lanes,)."""
-    mine, both = good(found), good(found) & good(paper)
-    ratio = found["stop_distance"] / shortest
-    gain = (paper["stop_distance"] - found["stop_distance"])[both] / shortest[both]
-    above, above_half = interval(ratio[mine] - 1, fixed.confidence)
-    each = 100 * (kept(ratio, mine) - 1)
+    stops, both = good(result), good(result) & good(paper)
+    ratio = result["stop_distance"] / shortest
+    gain = (paper["stop_distance"] - result["stop_distance"])[both] / shortest[both]
+    above, above_half = interval(ratio[stops] - 1, fixed.confidence)
+    each = 100 * (kept(ratio, stops) - 1)
     shorter, half = interval(gain, fixed.confidence)
     return {
         "above the bound [%]": 100 * above,
@@ -91,9 +91,9 @@ def line(fixed: Fixed, found: dict[str, Any], paper: dict[str, Any], shortest: n
         "shorter than the paper's [%]": 100 * shorter,
         "+- of that [%]": 100 * half,
         "both stop": int(both.sum()),
-        "locked": int(np.sum(found["locked_time"] > 0)),
-        "not stopped": int(np.sum(~found["stopped"] & ~found["diverged"])),
-        "diverged": int(np.sum(found["diverged"])),
+        "locked": int(np.sum(result["locked_time"] > 0)),
+        "not stopped": int(np.sum(~result["stopped"] & ~result["diverged"])),
+        "diverged": int(np.sum(result["diverged"])),
     }
 
 
@@ -101,7 +101,7 @@ def best(fixed: Fixed, results: dict[str, dict[str, Any]], shortest: np.ndarray)
     """Return the best of these rules by the criterion above: its name, and the mean of each over the common lanes
     [%]."""
     count = len(shortest)
-    allowed = [name for name, one in results.items() if np.sum(~good(one)) <= fixed.most_failures * count]
+    allowed = [name for name, result in results.items() if np.sum(~good(result)) <= fixed.most_failures * count]
     if not allowed:
         return {"best": None, "common lanes": 0, "above the bound [%]": {}}
     common = np.all([good(results[name]) for name in allowed], axis=0)

@@ -53,7 +53,7 @@ class Ranges:
     def of(self, rule: str) -> dict[str, tuple[Any, Any]]:
         """Ranges by path."""
         nodes = len(SlipByDeceleration().slips)
-        own: dict[str, Any] = {
+        of_reference: dict[str, Any] = {
             LATCH: {"slip": self.first},
             ROBUST: {"slip": self.first, "time_constant": self.filters, "threshold": self.threshold},
             FIXED: {"slip": self.slip},
@@ -67,7 +67,7 @@ class Ranges:
             },
         }[rule]
         shared = {path: (low, high) for path, low, high in self.controller}
-        return shared | {f"reference.{name}": ends for name, ends in own.items()}
+        return shared | {f"reference.{name}": ends for name, ends in of_reference.items()}
 
 
 @pytree
@@ -107,8 +107,8 @@ def loop(fixed: Fixed, sensors: str, reference: Any, controller: PID) -> Loop:
     """A car on a road with an edge."""
     road = Patches(roads=(MagicFormula(), MagicFormula()), edges=np.array([10.0]), width=fixed.roads.width)
     noise = Noise(deceleration=fixed.noise, period=fixed.period)
-    seen = Series(blocks=(noise, IntegratedAccelerometer(floor=fixed.floor))) if sensors == ERRORS else Direct()
-    parts = {"sensor": seen, "reference": reference, "stop": Standstill(speed=fixed.stop)}
+    sensor = Series(blocks=(noise, IntegratedAccelerometer(floor=fixed.floor))) if sensors == ERRORS else Direct()
+    parts = {"sensor": sensor, "reference": reference, "stop": Standstill(speed=fixed.stop)}
     controller = dataclasses.replace(controller, high=fixed.torque)
     return braking(plant=QuarterCar(inertia=INERTIA, road=road), controller=controller, **parts)
 
@@ -131,6 +131,6 @@ def told_the_peak(fixed: Fixed, sensors: str, controller: Any, lanes: Lanes) -> 
     """Return the loop that knows every road, under the controller of another loop, and its lanes."""
     batch, (before, beyond) = lanes.batch(sensors), lanes.bound.peaks
     edges = np.asarray(lanes.family.values["plant.road.edges"])[:, 0]
-    known = {"reference.before": before, "reference.beyond": beyond, "reference.edge": edges}
-    one = loop(fixed, sensors, PeakAtPlace(), controller)
-    return one, dataclasses.replace(batch, values=dict(batch.values) | known)
+    surfaces = {"reference.before": before, "reference.beyond": beyond, "reference.edge": edges}
+    informed = loop(fixed, sensors, PeakAtPlace(), controller)
+    return informed, dataclasses.replace(batch, values=dict(batch.values) | surfaces)

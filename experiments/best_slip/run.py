@@ -50,13 +50,13 @@ def judged(config: Config, loop: Loop, batch: Batch, finer: int = 1) -> Metrics:
     return {**runs.metrics, "stopped": runs.stopped, "diverged": runs.diverged}
 
 
-def contenders(config: Config, sensors: str, unseen: Lanes, own: dict[str, Loop]) -> dict[str, tuple[Loop, Batch]]:
+def contenders(config: Config, sensors: str, unseen: Lanes, loops: dict[str, Loop]) -> dict[str, tuple[Loop, Batch]]:
     """Return loops and lanes: untuned, tuned, and with known roads under the controller of the fixed slip."""
     batch = unseen.batch(sensors)
     sensor = start(config.ranges, config.fixed, sensors, FIXED).sensor
     cases = {name: (loop, batch) for name, loop in untuned(config.ranges, config.fixed, sensors)}
-    cases |= {name: (dataclasses.replace(loop, sensor=sensor), batch) for name, loop in own.items()}
-    return cases | {KNOWN: told_the_peak(config.fixed, sensors, own[FIXED].controller, unseen)}
+    cases |= {name: (dataclasses.replace(loop, sensor=sensor), batch) for name, loop in loops.items()}
+    return cases | {KNOWN: told_the_peak(config.fixed, sensors, loops[FIXED].controller, unseen)}
 
 
 def by_road(name: str, metrics: Metrics, unseen: Lanes) -> dict[str, Any]:
@@ -98,33 +98,33 @@ def of_sensors(
 ) -> tuple[dict[str, Any], dict[str, Metrics], dict[str, Loop]]:
     """Tune, judge and check the rules for these sensors. Returns the results, the metrics of every lane, and the
     loops by rule."""
-    fixed, found = config.fixed, {}
+    fixed, searches = config.fixed, {}
     for rule in config.rules[sensors]:
-        found[rule] = tuned(config.search, fixed, sensors, rule, config.ranges)
-        report(f"{sensors}, {rule}: {found[rule].tuned.objective[1]:.5f}")
-    own = carried | {rule: one.loop for rule, one in found.items()}
+        searches[rule] = tuned(config.search, fixed, sensors, rule, config.ranges)
+        report(f"{sensors}, {rule}: {searches[rule].tuned.objective[1]:.5f}")
+    loops = carried | {rule: search.loop for rule, search in searches.items()}
     unseen = lanes(fixed, fixed.roads.held_out, fixed.roads.seed + 1)
     shortest = unseen.bound.distance
-    those = contenders(config, sensors, unseen, own)
-    results = {name: judged(config, *one) for name, one in those.items()}
+    those = contenders(config, sensors, unseen, loops)
+    results = {name: judged(config, *case) for name, case in those.items()}
     report(f"{sensors}: judged")
-    named = {n: (f"tuned, {n}" if n in found else f"tuned for {EXACT}, {n}") if n in own else n for n in results}
-    checks = {named[name]: halved(config, *those[name], results[name], shortest) for name in (PAPER, *own)}
+    named = {n: (f"tuned, {n}" if n in searches else f"tuned for {EXACT}, {n}") if n in loops else n for n in results}
+    checks = {named[name]: halved(config, *those[name], results[name], shortest) for name in (PAPER, *loops)}
     report(f"{sensors}: halved")
     slopes = {
-        rule: against_differences(config.search, fixed, sensors, rule, config.ranges, one.loop)
-        for rule, one in found.items()
+        rule: against_differences(config.search, fixed, sensors, rule, config.ranges, search.loop)
+        for rule, search in searches.items()
     }
     report(f"{sensors}: differences")
     said = {
-        "table": [{"rule": named[n], **line(fixed, one, results[PAPER], shortest)} for n, one in results.items()],
-        "by road": [by_road(named[name], one, unseen) for name, one in results.items()],
-        "best": best(fixed, {rule: results[rule] for rule in own}, shortest),
-        "tuning": {rule: described(one) for rule, one in found.items()},
+        "table": [{"rule": named[n], **line(fixed, result, results[PAPER], shortest)} for n, result in results.items()],
+        "by road": [by_road(named[name], result, unseen) for name, result in results.items()],
+        "best": best(fixed, {rule: results[rule] for rule in loops}, shortest),
+        "tuning": {rule: described(search) for rule, search in searches.items()},
         "half the step": checks,
         "derivatives": slopes,
     }
-    return said, results, own
+    return said, results, loops
 
 
 def of_bounds(fixed: Fixed) -> dict[str, Any]:
@@ -147,8 +147,8 @@ def figure(config: Config, results: dict[str, dict[str, Metrics]], shortest: np.
         for j, name in enumerate((PAPER, *RULES, KNOWN)):
             if name not in those:
                 continue
-            one = those[name]
-            above = np.sort(100 * (one["stop_distance"] / shortest - 1)[good(one)])
+            result = those[name]
+            above = np.sort(100 * (result["stop_distance"] / shortest - 1)[good(result)])
             share = 100 * np.arange(1, len(above) + 1) / len(shortest)
             if not np.any(above <= config.farthest):  # a legend entry without a curve says why there is none
                 name = f"{name}: none within {config.farthest:g} %"
@@ -162,9 +162,9 @@ def figure(config: Config, results: dict[str, dict[str, Metrics]], shortest: np.
 def main(config: Config | None = None, progress: Callable[[str], None] = lambda line: None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config, begun = config or Config(), time.process_time()
-    tables, results, own = {}, {}, {}
+    tables, results, loops = {}, {}, {}
     for sensors in config.rules:
-        tables[sensors], results[sensors], own = of_sensors(config, sensors, progress, own)
+        tables[sensors], results[sensors], loops = of_sensors(config, sensors, progress, loops)
         count = config.fixed.roads.held_out
         record.print_rows(
             f"{sensors}: {count} roads, intervals of {config.fixed.confidence:.0%}", tables[sensors]["table"]

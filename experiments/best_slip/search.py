@@ -63,13 +63,13 @@ def mean_logarithm(values: Any) -> Any:
     return jnp.mean(jnp.log(values))
 
 
-def task(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, known: Lanes) -> dict[str, Any]:
+def task(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, roads: Lanes) -> dict[str, Any]:
     """The arguments of `build_problem`, but for the loop."""
     step = search.exact_step if sensors == EXACT else search.noisy_step
     return {
         "free": ranges.of(rule),
         "objective": {"stop_distance": 1.0},
-        "over": known.batch(sensors, weights=1 / known.bound.distance),
+        "over": roads.batch(sensors, weights=1 / roads.bound.distance),
         "solver": FixedStep(step=step, duration=fixed.longest),
         "measured": MEASURED,
         "aggregate": mean_logarithm,
@@ -82,48 +82,48 @@ def tuned(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges)
     begun = time.process_time()
     seed = fixed.roads.seed
 
-    def descend(one: Any, count: int, starts: int, iterations: int) -> Tuned:
+    def descend(loop: Any, count: int, starts: int, iterations: int) -> Tuned:
         how = Method(starts=starts, seed=search.seed, stopping=Stopping(change=1e-6, iterations=iterations))
-        known = lanes(fixed, count, seed)
-        return tune(build_problem(one, **task(search, fixed, sensors, rule, ranges, known)), method=how)
+        roads = lanes(fixed, count, seed)
+        return tune(build_problem(loop, **task(search, fixed, sensors, rule, ranges, roads)), method=how)
 
     tried = descend(start(ranges, fixed, sensors, rule), search.few, search.starts, search.tried)
-    found = descend(tried.part, search.roads, 1, search.iterations)
-    return Found(found, tried, time.process_time() - begun)
+    tuning = descend(tried.part, search.roads, 1, search.iterations)
+    return Found(tuning, tried, time.process_time() - begun)
 
 
-def described(found: Found) -> dict[str, Any]:
+def described(search: Found) -> dict[str, Any]:
     """Return the result of a search, and how it ended."""
-    one = found.tuned
+    tuning = search.tuned
     return {
-        "objective": {"before": float(one.objective[0]), "after": float(one.objective[1])},
-        "values": {path: np.asarray(x).tolist() for path, x in one.values.items()},
-        "reason": one.reason.value,
-        "gradients": one.evaluations,
-        "starts": [{"objective": s.objective, "reason": s.reason.value} for s in found.tried.starts],
-        "gradients of the starts": sum(s.history[-1].evaluations for s in found.tried.starts),
-        "seconds": found.seconds,
+        "objective": {"before": float(tuning.objective[0]), "after": float(tuning.objective[1])},
+        "values": {path: np.asarray(x).tolist() for path, x in tuning.values.items()},
+        "reason": tuning.reason.value,
+        "gradients": tuning.evaluations,
+        "starts": [{"objective": s.objective, "reason": s.reason.value} for s in search.tried.starts],
+        "gradients of the starts": sum(s.history[-1].evaluations for s in search.tried.starts),
+        "seconds": search.seconds,
     }
 
 
 def problem(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, loop: Loop) -> Problem:
     """The tuning's problem on all of its roads, around a loop."""
-    known = lanes(fixed, search.roads, fixed.roads.seed)
-    return build_problem(loop, **task(search, fixed, sensors, rule, ranges, known))
+    roads = lanes(fixed, search.roads, fixed.roads.seed)
+    return build_problem(loop, **task(search, fixed, sensors, rule, ranges, roads))
 
 
 def by_cma_es(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges) -> dict[str, Any]:
     """CMA-ES on all roads, from where the gradients started: the least objective, and where."""
     begun = time.process_time()
-    one = start(ranges, fixed, sensors, rule)
-    posed_ = problem(search, fixed, sensors, rule, ranges, one)
-    seen = posed_.objective_evaluator()
+    origin = start(ranges, fixed, sensors, rule)
+    posed_ = problem(search, fixed, sensors, rule, ranges, origin)
+    evaluate = posed_.objective_evaluator()
     options = {"maxfevals": search.cma_evaluations, "verbose": -9, "verb_log": 0, "seed": search.seed}
-    strategy = cma.CMAEvolutionStrategy(posed_.space.place(one), search.spread, options)
+    strategy = cma.CMAEvolutionStrategy(posed_.space.place(origin), search.spread, options)
     while not strategy.stop():
-        asked = strategy.ask()
-        values = np.asarray(seen(jnp.asarray(np.array(asked))).objective)
-        strategy.tell(asked, np.nan_to_num(values, nan=1e3, posinf=1e3).tolist())
+        population = strategy.ask()
+        values = np.asarray(evaluate(jnp.asarray(np.array(population))).objective)
+        strategy.tell(population, np.nan_to_num(values, nan=1e3, posinf=1e3).tolist())
     best = strategy.result
     values = {path: np.asarray(x).tolist() for path, x in posed_.space.values(best.xbest).items()}
     seconds = time.process_time() - begun
@@ -139,22 +139,22 @@ def against_differences(
     lane by lane: a mean of differences says nothing if a lane jumps, as a latch that takes another maximum. A lane
     agrees with a width to `agreement` of the derivative, or to 1e-5.
     """
-    known = lanes(fixed, search.roads, fixed.roads.seed)
-    given = task(search, fixed, sensors, rule, ranges, known)
-    coordinates, solver = parameter_space(loop, given["free"]), dataclasses.replace(given["solver"], kinks=True)
+    roads = lanes(fixed, search.roads, fixed.roads.seed)
+    arguments = task(search, fixed, sensors, rule, ranges, roads)
+    coordinates, solver = parameter_space(loop, arguments["free"]), dataclasses.replace(arguments["solver"], kinks=True)
     z = np.asarray(coordinates.place(loop))
     way = np.random.default_rng(search.seed).normal(size=len(z))
     way /= np.linalg.norm(way)
 
     def ratios(z: Any) -> Any:
-        run = run_batch(coordinates.at(loop, z), given["over"], solver, MEASURED, engine="kernel")
-        return run.metrics["stop_distance"] / known.bound.distance
+        run = run_batch(coordinates.at(loop, z), arguments["over"], solver, MEASURED, engine="kernel")
+        return run.metrics["stop_distance"] / roads.bound.distance
 
     along = jax.jit(lambda z: jax.jvp(ratios, (z,), (jnp.asarray(way),)))
     slope = np.asarray(along(z)[1])
-    fine, each = np.zeros(len(slope), bool), {}
+    verified, each = np.zeros(len(slope), bool), {}
     for width in search.widths:
         high, low = (np.asarray(along(z + sign * width * way)[0]) for sign in (1, -1))
         agrees = np.abs((high - low) / (2 * width) - slope) <= search.agreement * np.abs(slope) + 1e-5
-        each[f"{width:g}"], fine = int(np.sum(agrees)), fine | agrees
-    return {"lanes": len(slope), "agree by width": each, "agree with one": int(np.sum(fine))}
+        each[f"{width:g}"], verified = int(np.sum(agrees)), verified | agrees
+    return {"lanes": len(slope), "agree by width": each, "agree with one": int(np.sum(verified))}

@@ -38,9 +38,9 @@ def draw_residuals(config: Any, fits: dict[str, Identified]) -> Any:
     figure, axes = plot.sheet(1, 2, title="What the fits leave of Tables 1 and 2", size=(6, 4), sharey=True)
     rows = list(slip_estimator.PUBLISHED_STOPS)
     for j, (ax, unit) in enumerate(zip(axes, UNITS, strict=True)):
-        for i, (name, found) in enumerate(fits.items()):
+        for i, (name, fit) in enumerate(fits.items()):
             y = np.arange(len(rows)) + 0.12 * (i - (len(fits) - 1) / 2)
-            ax.plot(found.residuals.reshape(-1, 2)[:, j], y, "osD^v"[i % 5], color=plot.COLOURS[i], label=name, ms=5)
+            ax.plot(fit.residuals.reshape(-1, 2)[:, j], y, "osD^v"[i % 5], color=plot.COLOURS[i], label=name, ms=5)
         ax.axvspan(-config.rounding[j], config.rounding[j], color="#DDDDDD", zorder=0)
         for sign in (-1, 1):
             ax.axvline(sign * config.weights[j], color=plot.GREY, linewidth=1, linestyle="--")

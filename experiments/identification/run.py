@@ -110,12 +110,12 @@ class Spline:
 def loops(car: QuarterCar, config: Config) -> dict[str, Loop]:
     """The nine runs of the tables."""
     stop = Standstill(speed=config.stop)
-    found = {"no ABS": braking(plant=car, reference=FixedSlip(), controller=ConstantTorque(torque=90.0), stop=stop)}
+    cases = {"no ABS": braking(plant=car, reference=FixedSlip(), controller=ConstantTorque(torque=90.0), stop=stop)}
     for method, reference in (("conventional", FixedSlip()), ("proposed", PeakLatch())):
         for name, (ki, kd) in slip_estimator.PID_GAINS.items():
             controller = PID(kp=3893.0, ki=ki, kd=kd, low=0.0, high=90.0)
-            found[f"{method} {name}"] = braking(plant=car, reference=reference, controller=controller, stop=stop)
-    return found
+            cases[f"{method} {name}"] = braking(plant=car, reference=reference, controller=controller, stop=stop)
+    return cases
 
 
 def tables(car: QuarterCar, config: Config, weights: tuple[float, float]) -> tuple[Loop, Table]:
@@ -161,12 +161,12 @@ class Smoothness:
         """mu."""
         return (1 - self.config.blend) * near.friction(slip) + self.config.blend * far.friction(slip)
 
-    def __call__(self, near: MagicFormula, far: MagicFormula, known: Any, loop: Any) -> Any:
-        """(16 + 15 + 2,); known: inertia and peak."""
+    def __call__(self, near: MagicFormula, far: MagicFormula, means: Any, loop: Any) -> Any:
+        """(16 + 15 + 2,); means: inertia and peak."""
         plant = loop.plant
         away = plant.road.mu - jax.vmap(lambda s: self.curve(near, far, s))(plant.road.slips())
         bends = jnp.diff(jnp.concatenate([jnp.zeros(1), away]), n=2)
-        others = jnp.stack([plant.inertia - known[0], plant.road.peak - known[1]]) / jnp.array(self.config.others)
+        others = jnp.stack([plant.inertia - means[0], plant.road.peak - means[1]]) / jnp.array(self.config.others)
         return jnp.concatenate([away / self.config.height, bends / self.config.roughness, others])
 
 
@@ -176,12 +176,12 @@ def highest(curve: Any) -> float:
     return float(slips[np.argmax(np.asarray(jax.vmap(curve)(slips)))])
 
 
-def spline(config: Config, found: Identified, means: tuple[float, ...]) -> Identified:
+def spline(config: Config, fit: Identified, means: tuple[float, ...]) -> Identified:
     """The spline from the Magic Formula found, with a prior about its blend with a stated one."""
-    near, far = found.part.plant.road, MagicFormula(**dict(zip("BCDE", means[1:], strict=True)))
-    smooth, inertia, peak = Smoothness(config), float(found.values["plant.inertia"]), highest(near.friction)
-    known = jnp.array([inertia, highest(lambda s: smooth.curve(near, far, s))])
-    prior = Partial(smooth, canonical_dtypes(near), canonical_dtypes(far), known)
+    near, far = fit.part.plant.road, MagicFormula(**dict(zip("BCDE", means[1:], strict=True)))
+    smooth, inertia, peak = Smoothness(config), float(fit.values["plant.inertia"]), highest(near.friction)
+    expected = jnp.array([inertia, highest(lambda s: smooth.curve(near, far, s))])
+    prior = Partial(smooth, canonical_dtypes(near), canonical_dtypes(far), expected)
     road = Spline(peak=peak, mu=np.ones(len(BELOW) + 1 + len(ABOVE)))
     road = dataclasses.replace(road, mu=np.asarray(jax.vmap(near.friction)(road.slips())))
     loop, table = tables(QuarterCar(inertia=inertia, road=road), config, config.spline_weights)
@@ -190,28 +190,28 @@ def spline(config: Config, found: Identified, means: tuple[float, ...]) -> Ident
     return identify(loop, table, free, solver=solver, prior=prior, tolerances=ends)
 
 
-def summary(name: str, found: Identified, start: dict[str, Any] | None = None) -> dict[str, Any]:
+def summary(name: str, fit: Identified, start: dict[str, Any] | None = None) -> dict[str, Any]:
     """A row for each fit: worst residuals, parameters."""
-    worst = np.abs(found.residuals.reshape(-1, 2)).max(axis=0)
-    line = {"fit": name, "start J": float((start or found.start)[PATHS[0]]), "J": float(found.values[PATHS[0]])}
+    worst = np.abs(fit.residuals.reshape(-1, 2)).max(axis=0)
+    line = {"fit": name, "start J": float((start or fit.start)[PATHS[0]]), "J": float(fit.values[PATHS[0]])}
     for path in PATHS[1:]:
-        if path in found.values:
-            line[path.rpartition(".")[2]] = float(found.values[path])
-    return {**line, "worst [s]": worst[0], "worst [m]": worst[1], "runs": found.evaluations, "ended": found.reason.name}
+        if path in fit.values:
+            line[path.rpartition(".")[2]] = float(fit.values[path])
+    return {**line, "worst [s]": worst[0], "worst [m]": worst[1], "runs": fit.evaluations, "ended": fit.reason.name}
 
 
-def directions(found: Identified, most: int = 6) -> list[dict[str, Any]]:
+def directions(fit: Identified, count: int = 6) -> list[dict[str, Any]]:
     """Return the directions of the parameters, first the least determined one. An infinite spread becomes None."""
-    chosen = found.uncertainty.directions[::-1][:most]
-    short = [one.describe(0.15).replace("plant.", "").replace("road.", "") for one in chosen]
-    spreads = [one.spread if np.isfinite(one.spread) else None for one in chosen]
+    loosest = fit.uncertainty.directions[::-1][:count]
+    short = [direction.describe(0.15).replace("plant.", "").replace("road.", "") for direction in loosest]
+    spreads = [direction.spread if np.isfinite(direction.spread) else None for direction in loosest]
     return [{"relative spread": spread, "direction": text} for spread, text in zip(spreads, short, strict=True)]
 
 
-def known(found: Identified) -> list[dict[str, Any]]:
+def known(fit: Identified) -> list[dict[str, Any]]:
     """Parameters with their standard deviations."""
-    values = np.concatenate([np.ravel(x) for x in found.values.values()])
-    rows = zip(found.uncertainty.deviations.items(), values, strict=True)
+    values = np.concatenate([np.ravel(x) for x in fit.values.values()])
+    rows = zip(fit.uncertainty.deviations.items(), values, strict=True)
     return [{"parameter": name, "value": float(value), "deviation": sd} for (name, sd), value in rows]
 
 
@@ -223,7 +223,7 @@ def from_tables(config: Config) -> tuple[list[dict[str, Any]], dict[str, Identif
         fits[name] = stages[-1]
         rows.append(summary(name, stages[-1], stages[0].start))
         rows[-1]["runs"] = sum(stage.evaluations for stage in stages)
-    best = min(fits.values(), key=lambda one: one.cost)
+    best = min(fits.values(), key=lambda fit: fit.cost)
     ends = Tolerances(cost=1e-6, step=1e-6, evaluations=40)
     fits["rounding"] = magic(config, best.values, config.rounding, tolerances=ends, absolute=False)
     fits["minimax"] = magic(config, best.values, config.weights, tolerances=ends, absolute=False, norm=config.norm)
@@ -234,7 +234,7 @@ def from_tables(config: Config) -> tuple[list[dict[str, Any]], dict[str, Identif
 
 def residual_rows(fits: dict[str, Identified]) -> list[dict[str, Any]]:
     """Differences by row of the tables."""
-    table = {name: found.residuals.reshape(-1, 2) for name, found in fits.items()}
+    table = {name: fit.residuals.reshape(-1, 2) for name, fit in fits.items()}
     return [
         {"run": row, **{f"{name} [{u}]": float(x[i, j]) for name, x in table.items() for j, u in enumerate(UNITS)}}
         for i, row in enumerate(slip_estimator.PUBLISHED_STOPS)

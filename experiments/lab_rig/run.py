@@ -61,8 +61,8 @@ def checks(config: Config) -> list[dict[str, Any]]:
         ("wheel", "drum", "brake"), ("rad/s^2", "rad/s^2", "N m/s"), rates[:3], config.derivative, strict=True
     ):
         rows.append(record.computed_row("at (100, 140, 3), u = 0.6", f"d({name})/dt", unit, ours, reference=exact))
-    _, _, asked = rig.contact(LabRigState(0.0, 100.0, 9.0, 0.0))
-    rows.append(record.computed_row("locked, brake 9 N m", "torque carried", "N m", asked))
+    _, _, torque = rig.contact(LabRigState(0.0, 100.0, 9.0, 0.0))
+    rows.append(record.computed_row("locked, brake 9 N m", "torque carried", "N m", torque))
     for brake in (9.0, 1.0):
         rate = rig.derivative(0.0, LabRigState(0.0, 100.0, brake, 0.0), 1.0).wheel
         rows.append(record.computed_row(f"locked, brake {brake:g} N m", "d(wheel)/dt", "rad/s^2", rate))
@@ -114,10 +114,14 @@ def critical_lags(config: Config) -> list[dict[str, Any]]:
     for speed in (*config.speeds_kmh, math.inf):
         omega = speed / 3.6 / MirroredRig().body_radius
         formula = excess / (beta * k1 + alpha * excess / omega)
-        found = None if math.isinf(omega) else bisected(config, omega)
+        critical = None if math.isinf(omega) else bisected(config, omega)
         name = "any speed" if math.isinf(omega) else f"{speed:g} km/h"
         rows.append(
-            {"at": name, "formula [ms]": 1e3 * formula, "eigenvalues [ms]": None if found is None else 1e3 * found}
+            {
+                "at": name,
+                "formula [ms]": 1e3 * formula,
+                "eigenvalues [ms]": None if critical is None else 1e3 * critical,
+            }
         )
     return rows
 
@@ -188,12 +192,12 @@ def settles(config: Config) -> list[dict[str, Any]]:
 
 def figures(runs: dict[str, Run], lagging: dict[str, Run]) -> dict[str, Any]:
     """Speeds of the rig at constant commands; slips under the longest lag."""
-    seen: dict[str, Any] = {name: run.trajectory for name, run in runs.items()}
-    chosen = dict(list(seen.items())[1:4])
+    trajectories: dict[str, Any] = {name: run.trajectory for name, run in runs.items()}
+    middle = dict(list(trajectories.items())[1:4])
     braked = list(lagging.items())[1:]  # unlimited torque also drives the wheel, which no brake does
     slips: dict[str, Any] = {name: run.trajectory for name, run in braked}
     return {
-        "open_loop": plot.draw_speeds(chosen, title="Laboratory rig, constant brake command"),
+        "open_loop": plot.draw_speeds(middle, title="Laboratory rig, constant brake command"),
         "lag": plot.draw_slips(slips, title="Published gain behind the rig's 49 ms brake lag", until=2.0),
     }
 

@@ -17,8 +17,8 @@ def compare(numbers):
     lines = []
     for row in json.loads(TABLE.read_text(encoding="utf-8"))["rows"]:
         yours = numbers.get(f"{row['source']}: {row['quantity']}")
-        known = yours is not None and row["ours"] is not None and row["tolerance"] is not None
-        agrees = abs(yours - row["ours"]) <= max(row["tolerance"], 1e-3 * abs(row["ours"])) if known else None
+        comparable = yours is not None and row["ours"] is not None and row["tolerance"] is not None
+        agrees = abs(yours - row["ours"]) <= max(row["tolerance"], 1e-3 * abs(row["ours"])) if comparable else None
         lines.append((row["source"], row["quantity"], row["unit"], row["printed"], row["ours"], yours, agrees))
     return lines
 

@@ -45,7 +45,7 @@ def bare(problem: Problem) -> Problem:
 
 def allowed(config: Config, parameters: int) -> int:
     """Evaluations of a derivative-free search."""
-    return next(budget for most, budget in config.budgets if parameters <= most)
+    return next(budget for greatest, budget in config.budgets if parameters <= greatest)
 
 
 def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
@@ -55,13 +55,13 @@ def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
     large = int(problem.space.size > 2)
     prices = searches.prices(problem, config.repeats)
     mode = min(prices, key=lambda mode: prices[mode])
-    most = config.iterations[large]
-    stopping = Stopping(gradient=1e-9, change=1e-11, iterations=most)
+    iterations = config.iterations[large]
+    stopping = Stopping(gradient=1e-9, change=1e-11, iterations=iterations)
     tuning = tune(pose(mode=mode), method=Method(memory=searches.MEMORY, stopping=stopping))
     print(f"{name}: tune {tuning.objective[1]:.9g}, {tuning.evaluations} gradients; {tuning.reason.value}", flush=True)
     budget = allowed(config, problem.space.size)
-    asked: dict[str, Callable[[], searches.Trace]] = {
-        GRADIENTS: lambda: searches.gradients(problem, mode, most),
+    calls: dict[str, Callable[[], searches.Trace]] = {
+        GRADIENTS: lambda: searches.gradients(problem, mode, iterations),
         DIFFERENCES: lambda: searches.differences(problem, budget),
         NELDER_MEAD: lambda: searches.nelder_mead(problem, budget),
         **{
@@ -70,7 +70,7 @@ def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
         },
     }
     traces = {TUNE: [(float(p.evaluations), p.objective) for p in tuning.history]}
-    for who, search in asked.items():
+    for who, search in calls.items():
         traces[who] = search()
         print(f"{name}: {who} {traces[who][-1]}", flush=True)
     return {
@@ -87,10 +87,10 @@ def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
     }, tuning
 
 
-def lines(config: Config, kept: dict[str, Any]) -> list[dict[str, Any]]:
+def lines(config: Config, comparison: dict[str, Any]) -> list[dict[str, Any]]:
     """The rows of one problem, one for each accuracy."""
-    start, best = kept["start"], min(kept["found"].values())
-    return [line(kept, f"{near:g}", best + near * (start - best)) for near in config.near]
+    start, best = comparison["start"], min(comparison["found"].values())
+    return [line(comparison, f"{near:g}", best + near * (start - best)) for near in config.near]
 
 
 def line(problem: dict[str, Any], accuracy: str, target: float) -> dict[str, Any]:
@@ -154,10 +154,12 @@ def paper(config: Config) -> np.ndarray:
     return design(box(config), Spec(Q=config.weights, R=1.0)).gain[0]
 
 
-def figures(kept: list[dict[str, Any]]) -> dict[str, Any]:
+def figures(comparisons: list[dict[str, Any]]) -> dict[str, Any]:
     """Distance to the best over rollouts, one panel per problem."""
-    figure, axes = plot.sheet(-(-len(kept) // 3), min(3, len(kept)), title="What a gradient is worth", size=(5.0, 3.3))
-    for ax, row in zip(axes, kept, strict=False):
+    figure, axes = plot.sheet(
+        -(-len(comparisons) // 3), min(3, len(comparisons)), title="What a gradient is worth", size=(5.0, 3.3)
+    )
+    for ax, row in zip(axes, comparisons, strict=False):
         best = min(row["found"].values())
         for i, (name, trace) in enumerate(row["traces"].items()):
             n, value = np.array(trace).T
@@ -167,7 +169,7 @@ def figures(kept: list[dict[str, Any]]) -> dict[str, Any]:
             ax.loglog(n, gap, label=name, drawstyle="steps-post", **style)
         title = f"{row['problem']}: {row['parameters']} parameters"
         plot.label_axes(ax, "rollouts of the batch", "distance to the best", title)
-    for ax in axes[len(kept) :]:
+    for ax in axes[len(comparisons) :]:
         ax.set_visible(False)
     return {"searches": figure}
 
@@ -178,19 +180,19 @@ def main(config: Config | None = None, names: tuple[str, ...] = NAMES) -> dict[s
     folder = pathlib.Path(config.out)
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        kept, found = compared(config, name)
+        comparison, tuning = compared(config, name)
         record.write_summary(
-            folder, kept | {"gains": gains(config, {name: found})}, name=f"{name.replace(' ', '_')}.json"
+            folder, comparison | {"gains": gains(config, {name: tuning})}, name=f"{name.replace(' ', '_')}.json"
         )
     files = [folder / f"{name.replace(' ', '_')}.json" for name in NAMES]
-    kept = [json.loads(path.read_text(encoding="utf-8")) for path in files if path.exists()]
-    rows = [row for one in kept for row in lines(config, one)]
+    comparisons = [json.loads(path.read_text(encoding="utf-8")) for path in files if path.exists()]
+    rows = [row for comparison in comparisons for row in lines(config, comparison)]
     record.print_rows("Rollouts of the batch", rows)
-    end = [row for one in kept for row in one["gains"]]
+    end = [row for comparison in comparisons for row in comparison["gains"]]
     if end:
         record.print_rows("Gains on the rig", end)
     results = {"table": rows, "gains": end, "paper_weights_gain": paper(config).tolist()}
-    return record.experiment(config, results, figures(kept))
+    return record.experiment(config, results, figures(comparisons))
 
 
 if __name__ == "__main__":

@@ -47,8 +47,8 @@ def prices(problem: Problem, repeats: int) -> dict[DerivativeMode, float]:
     ratios: dict[DerivativeMode, list[float]] = {mode: [] for mode in modes}
     for _ in range(repeats):
         for mode, gradient in gradients.items():
-            own, other = _time(value, z), _time(gradient, z, m)
-            ratios[mode].append(other / own)
+            seconds, other = _time(value, z), _time(gradient, z, m)
+            ratios[mode].append(other / seconds)
     return {mode: statistics.median(ratio) for mode, ratio in ratios.items()}
 
 
@@ -63,9 +63,9 @@ class Counted:
 
     def __init__(self, problem: Problem):
         """Compiled once for each number of points that are asked for together."""
-        self._seen, self._steady = problem.objective_evaluator(), problem.steady()
-        self._asked: np.ndarray | None = None
-        self.count, self.least = 0, np.inf
+        self._evaluate, self._steady = problem.objective_evaluator(), problem.steady()
+        self._steady_at: np.ndarray | None = None
+        self.count, self.best = 0, np.inf
         self.trace: Trace = []
 
     def __call__(self, z: Any) -> float:
@@ -74,8 +74,8 @@ class Counted:
 
     def each(self, points: np.ndarray) -> list[float]:
         """Return the values at several points, which run together and count one after the other."""
-        seen = jax.device_get(self._seen(jnp.asarray(points)))
-        return [self._counted(*one) for one in zip(points, seen.objective, seen.diverged, strict=True)]
+        evaluation = jax.device_get(self._evaluate(jnp.asarray(points)))
+        return [self._counted(*point) for point in zip(points, evaluation.objective, evaluation.diverged, strict=True)]
 
     def slope(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         """The value at z, and its forward differences."""
@@ -86,18 +86,18 @@ class Counted:
         self.count += 1
         if not np.isfinite(value) or diverged:
             return REJECTED
-        if value < self.least:
+        if value < self.best:
             if not self._stable(z):
                 return REJECTED
-            self.least = float(value)
-            self.trace.append((self.count, self.least))
+            self.best = float(value)
+            self.trace.append((self.count, self.best))
         return float(value)
 
     def _stable(self, z: np.ndarray) -> bool:
-        if self._asked is None or np.max(np.abs(z - self._asked)) > NEAR:
+        if self._steady_at is None or np.max(np.abs(z - self._steady_at)) > NEAR:
             if not self._steady(z[None])[0]:
                 return False
-            self._asked = z
+            self._steady_at = z
         return True
 
 
@@ -106,7 +106,7 @@ def nelder_mead(problem: Problem, budget: int) -> Trace:
     f, start = Counted(problem), problem.space.place(problem.subject)
     options = {"maxfev": budget, "maxiter": budget, "xatol": 1e-6, "fatol": 1e-12, "adaptive": len(start) > 2}
     minimize(f, start, method="Nelder-Mead", options=options)
-    return [*f.trace, (f.count, f.least)]
+    return [*f.trace, (f.count, f.best)]
 
 
 def cma_es(problem: Problem, budget: int, seed: int, first: float) -> Trace:
@@ -115,19 +115,19 @@ def cma_es(problem: Problem, budget: int, seed: int, first: float) -> Trace:
     options = {"maxfevals": budget, "verbose": -9, "seed": seed, "verb_log": 0, "tolfun": 1e-12}
     search = cma.CMAEvolutionStrategy(start, first, options)
     while not search.stop():
-        asked = search.ask()
-        search.tell(asked, f.each(np.array(asked)))
-    return [*f.trace, (f.count, f.least)]
+        population = search.ask()
+        search.tell(population, f.each(np.array(population)))
+    return [*f.trace, (f.count, f.best)]
 
 
 def differences(problem: Problem, budget: int) -> Trace:
     """SciPy's L-BFGS-B on forward differences, to its own end or the budget of rollouts."""
     f = Counted(problem)
     _scipy_lbfgs(problem, f.slope, budget // (1 + problem.space.size))
-    return [*f.trace, (f.count, f.least)]
+    return [*f.trace, (f.count, f.best)]
 
 
-def gradients(problem: Problem, mode: DerivativeMode, most: int) -> Trace:
+def gradients(problem: Problem, mode: DerivativeMode, evaluations: int) -> Trace:
     """SciPy's L-BFGS-B on derivatives, to its own end or so many of them; counted in gradients."""
     evaluate, steady = dataclasses.replace(problem, mode=mode).evaluator(1.0), problem.steady()
     none, trace, spent = Multipliers(np.zeros((1, 0)), np.ones(1)), [], 0
@@ -135,20 +135,20 @@ def gradients(problem: Problem, mode: DerivativeMode, most: int) -> Trace:
     def slope(z: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal spent
         spent += 1
-        found = jax.device_get(evaluate(jnp.asarray(z)[None], none))
-        value, gradient = float(found.loss[0]), np.asarray(found.gradient[0])
-        fine = np.isfinite(value) and np.isfinite(gradient).all() and not found.evaluation.diverged[0]
-        if not fine or not steady(z[None])[0]:
+        result = jax.device_get(evaluate(jnp.asarray(z)[None], none))
+        value, gradient = float(result.loss[0]), np.asarray(result.gradient[0])
+        finite = np.isfinite(value) and np.isfinite(gradient).all() and not result.evaluation.diverged[0]
+        if not finite or not steady(z[None])[0]:
             return REJECTED, np.zeros_like(z)
         if not trace or value < trace[-1][1]:
             trace.append((float(spent), value))
         return value, gradient
 
-    _scipy_lbfgs(problem, slope, most)
+    _scipy_lbfgs(problem, slope, evaluations)
     return [*trace, (float(spent), trace[-1][1])]
 
 
-def _scipy_lbfgs(problem: Problem, slope: Callable[[np.ndarray], tuple[float, np.ndarray]], most: int) -> None:
+def _scipy_lbfgs(problem: Problem, slope: Callable[[np.ndarray], tuple[float, np.ndarray]], evaluations: int) -> None:
     """Its tolerances are absolute, so it is given the objective in units of that at the start."""
     start = problem.space.place(problem.subject)
     size = abs(slope(start)[0])
@@ -157,7 +157,7 @@ def _scipy_lbfgs(problem: Problem, slope: Callable[[np.ndarray], tuple[float, np
         value, gradient = slope(z)
         return value / size, gradient / size
 
-    options = {"maxfun": most - 1, "maxiter": most, "ftol": 1e-15, "gtol": 1e-10, "maxcor": MEMORY}
+    options = {"maxfun": evaluations - 1, "maxiter": evaluations, "ftol": 1e-15, "gtol": 1e-10, "maxcor": MEMORY}
     minimize(scaled, start, jac=True, method="L-BFGS-B", options=options)
 
 

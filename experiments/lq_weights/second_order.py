@@ -49,20 +49,20 @@ class Counted:
 
         def evaluate(z: Any) -> Any:
             def objective(z: Any) -> Any:
-                found = problem.evaluate(z)
-                return found.objective, (found.objective, found.diverged)
+                evaluation = problem.evaluate(z)
+                return evaluation.objective, (evaluation.objective, evaluation.diverged)
 
             gradient, (value, diverged) = jax.jacfwd(objective, has_aux=True)(z)
             return value, gradient, diverged
 
-        self._one, self._many, self._steady = jax.jit(evaluate), jax.jit(jax.vmap(evaluate)), problem.steady()
+        self._gradient, self._gradients, self._steady = jax.jit(evaluate), jax.jit(jax.vmap(evaluate)), problem.steady()
         self.begin(np.inf)
 
     def begin(self, budget: float) -> None:
         """Start a new count of gradients, with this budget."""
         self.budget, self.spent, self.trace = budget, 0.0, []
         self.best: Any = None
-        self._asked: Any = None
+        self._steady_at: Any = None
 
     def _pay(self, gradients: float) -> None:
         if self.spent >= self.budget:
@@ -72,9 +72,9 @@ class Counted:
     def slope(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         """Return value and gradient."""
         self._pay(1)
-        value, gradient, diverged = jax.device_get(self._one(jnp.asarray(z)))
-        fine = np.isfinite(value) and np.isfinite(gradient).all() and not diverged
-        if not fine or not self._stable(z):
+        value, gradient, diverged = jax.device_get(self._gradient(jnp.asarray(z)))
+        finite = np.isfinite(value) and np.isfinite(gradient).all() and not diverged
+        if not finite or not self._stable(z):
             return REJECTED, np.zeros_like(z)
         if not self.trace or value < self.trace[-1][1]:
             self.trace.append((self.spent, float(value)))
@@ -82,25 +82,25 @@ class Counted:
         return float(value), gradient
 
     def _stable(self, z: np.ndarray) -> bool:
-        if self._asked is None or np.max(np.abs(z - self._asked)) > NEAR:
+        if self._steady_at is None or np.max(np.abs(z - self._steady_at)) > NEAR:
             if not self._steady(z[None])[0]:
                 return False
-            self._asked = z.copy()
+            self._steady_at = z.copy()
         return True
 
     def hessian(self, z: np.ndarray) -> np.ndarray:
         """Return the symmetric part of the forward differences of gradients."""
         self._pay(z.size)
-        _, here, _ = self._one(jnp.asarray(z))  # known to the search, so that it costs nothing more
-        _, ahead, _ = self._many(jnp.asarray(z + WIDTH * np.eye(z.size)))
-        found = np.nan_to_num((np.asarray(ahead) - np.asarray(here)) / WIDTH)
-        return (found + found.T) / 2
+        _, here, _ = self._gradient(jnp.asarray(z))  # known to the search, so that it costs nothing more
+        _, ahead, _ = self._gradients(jnp.asarray(z + WIDTH * np.eye(z.size)))
+        matrix = np.nan_to_num((np.asarray(ahead) - np.asarray(here)) / WIDTH)
+        return (matrix + matrix.T) / 2
 
     def inverse(self, z: np.ndarray) -> np.ndarray:
         """Return the inverse of the Hessian with eigenvalues made positive."""
         values, vectors = np.linalg.eigh(self.hessian(z))
-        found = (vectors / np.maximum(np.abs(values), FLOOR * np.abs(values).max())) @ vectors.T
-        return (found + found.T) / 2
+        matrix = (vectors / np.maximum(np.abs(values), FLOOR * np.abs(values).max())) @ vectors.T
+        return (matrix + matrix.T) / 2
 
 
 def searched(f: Counted, name: str, start: np.ndarray, budget: float) -> dict[str, Any]:
@@ -130,14 +130,14 @@ def compared(name: str, starts: int, budget: float) -> list[dict[str, Any]]:
     drawn = origin + 0.5 * np.random.default_rng(3).normal(size=(starts - 1, origin.size))
     rows = []
     for number, start in enumerate([origin, *drawn]):
-        found = {one: searched(f, one, start, budget) for one in NAMED}
-        best = min(one["best"] for one in found.values())
-        for who, one in found.items():
+        results = {search: searched(f, search, start, budget) for search in NAMED}
+        best = min(result["best"] for result in results.values())
+        for who, result in results.items():
             reached = {
-                f"{near:g}": next((n for n, value in one["trace"] if value <= best + near * abs(best)), None)
+                f"{near:g}": next((n for n, value in result["trace"] if value <= best + near * abs(best)), None)
                 for near in NEARNESS
             }
-            rows.append({"problem": name, "start": number, "search": who, **one, "reached": reached})
+            rows.append({"problem": name, "start": number, "search": who, **result, "reached": reached})
     return rows
 
 
@@ -145,11 +145,11 @@ def prices(name: str, repeats: int = 5) -> dict[str, float]:
     """Return processor times of derivatives over that of a value by XLA, and how far the Hessians are apart."""
     problem = problems(Config())[name]()
     measured = {metric: problem.measured[metric] for metric in problem.weights}
-    found = {}
+    numbers = {}
     z = jnp.asarray(problem.space.place(problem.subject))
     for engine in ("kernel", "xla"):
-        one = dataclasses.replace(problem, measured=measured, engine=engine)
-        value = lambda z, one=one: one.evaluate(z).objective  # noqa: E731
+        posed = dataclasses.replace(problem, measured=measured, engine=engine)
+        value = lambda z, posed=posed: posed.evaluate(z).objective  # noqa: E731
         calls = {"value": jax.jit(value), "gradient": jax.jit(jax.jacfwd(value))}
         if engine == "xla":
             calls["Hessian"] = jax.jit(jax.jacfwd(jax.jacfwd(value)))
@@ -162,12 +162,12 @@ def prices(name: str, repeats: int = 5) -> dict[str, float]:
                 times[key].append(time.process_time() - begun)
         for key, taken in times.items():
             ratios = [a / b for a, b in zip(taken, times["value"], strict=True)]
-            found[f"{engine}: {key} over value"] = statistics.median(ratios)
+            numbers[f"{engine}: {key} over value"] = statistics.median(ratios)
         if engine == "xla":
             differences = Counted(dataclasses.replace(problem, measured=measured, engine="kernel")).hessian(np.array(z))
             exact = np.asarray(results["Hessian"])
-            found["differences from exact"] = float(np.abs(differences - exact).max() / np.abs(exact).max())
-    return found
+            numbers["differences from exact"] = float(np.abs(differences - exact).max() / np.abs(exact).max())
+    return numbers
 
 
 def main(words: list[str]) -> None:

@@ -239,30 +239,30 @@ def effects(first: Record, second: Record, rig: Any) -> list[dict[str, Any]]:
 
     def try_effect(recorded: RecordedRun, free: Mapping[str, tuple[float, float]], effect: Effect) -> tuple[Any, Any]:
         trial = changed(recorded, effect)
-        wanted = free_in(trial, {**free, **effect.free})
+        ranges = free_in(trial, {**free, **effect.free})
         if effect.name == "lags that differ":
-            wanted.pop("loop.plant.brake_rate")
-        return fit_record(trial, wanted, first, until=HALF, tolerance=1e-3), wanted
+            ranges.pop("loop.plant.brake_rate")
+        return fit_record(trial, ranges, first, until=HALF, tolerance=1e-3), ranges
 
     mask = lab_rig.build_run(first, True, MASK)
     row("the mask, no dead time", replace(mask, {"loop.actuator": Direct()}), 0, None)
     recorded, free = changed(lab_rig.build_run(first, True, rig), BASE), dict(BASE.free)
     best = (math.inf, math.inf)
 
-    def add_row(effect: Effect, found: Identified) -> tuple[float, float]:
-        line = row(effect.name, found.part, len(found.values), None)
-        seen = line["second half [%]"], line["its slip [1]"]
-        deviations = found.uncertainty.deviations
-        line["determined"] = all(abs(found.values[path]) > 2 * deviations[path] for path in effect.free)
-        better = seen[0] < (1 - LEAST_GAIN) * best[0] and seen[1] <= best[1]
+    def add_row(effect: Effect, fit: Identified) -> tuple[float, float]:
+        line = row(effect.name, fit.part, len(fit.values), None)
+        errors = line["second half [%]"], line["its slip [1]"]
+        deviations = fit.uncertainty.deviations
+        line["determined"] = all(abs(fit.values[path]) > 2 * deviations[path] for path in effect.free)
+        better = errors[0] < (1 - LEAST_GAIN) * best[0] and errors[1] <= best[1]
         line["stays"] = better and line["determined"]
-        return seen
+        return errors
 
     for effect in (BASE, *CHAIN):
-        found, wanted = try_effect(recorded, free, effect)
-        seen = add_row(effect, found)
+        fit, ranges = try_effect(recorded, free, effect)
+        errors = add_row(effect, fit)
         if rows[-1]["stays"]:
-            recorded, free, best = found.part, wanted, seen
+            recorded, free, best = fit.part, ranges, errors
     for effect in SINGLE:
         add_row(effect, try_effect(recorded, free, effect)[0])
     return rows
@@ -278,16 +278,16 @@ def from_ten_starts(first: Record, second: Record, rig: LabRig) -> list[dict[str
         for tyre, plant, more in (("rigid", rig, {}), ("compliant", as_compliant(rig), SINGLE[-1].free)):
             starts = [start | dict.fromkeys(more, 0.1) for start in TEN_STARTS]
             run = lab_rig.build_run(first, True, plant)
-            for one in sorted(fit_record(run, free | more, first, until, starts).starts, key=lambda one: one.cost):
-                rest = compare_with_record(one.part, first, first=HALF)
-                own, other = lab_rig.judge(first, plant, one.values), lab_rig.judge(second, plant, one.values)
+            for fit in sorted(fit_record(run, free | more, first, until, starts).starts, key=lambda fit: fit.cost):
+                rest = compare_with_record(fit.part, first, first=HALF)
+                here, other = lab_rig.judge(first, plant, fit.values), lab_rig.judge(second, plant, fit.values)
                 rows.append({
-                    "tyre": tyre, "fitted to": fitted, "cost": one.cost,
-                    **{path.rpartition(".")[2]: f"{float(value):.4g}" for path, value in one.values.items()},
+                    "tyre": tyre, "fitted to": fitted, "cost": fit.cost,
+                    **{path.rpartition(".")[2]: f"{float(value):.4g}" for path, value in fit.values.items()},
                     "second half [%]": rest.wheel_rms_percent, "its slip [1]": rest.slip_rms,
-                    "1 given [%]": own["wheel_rms_percent_given"], "1 slip [1]": own["slip_rms_given"],
-                    "1 own [%]": own["wheel_rms_percent_own"], "1 cycles": own["cycles"],
-                    "1 stop [s]": own["stop_time"],
+                    "1 given [%]": here["wheel_rms_percent_given"], "1 slip [1]": here["slip_rms_given"],
+                    "1 own [%]": here["wheel_rms_percent_own"], "1 cycles": here["cycles"],
+                    "1 stop [s]": here["stop_time"],
                     "2 given [%]": other["wheel_rms_percent_given"], "2 slip [1]": other["slip_rms_given"],
                     "2 own [%]": other["wheel_rms_percent_own"], "2 cycles": other["cycles"],
                     "2 stop [s]": other["stop_time"],
@@ -295,24 +295,24 @@ def from_ten_starts(first: Record, second: Record, rig: LabRig) -> list[dict[str
     return rows
 
 
-def diagnosis(first: Record, second: Record, rig: LabRig, found: Identified) -> list[dict[str, Any]]:
+def diagnosis(first: Record, second: Record, rig: LabRig, fit: Identified) -> list[dict[str, Any]]:
     """Return the parameters that fit experiment 2 alone, beside those of experiment 1.
 
     Also returns how well each set follows both experiments under their commands. No number of the identified rig
     comes from here.
     """
     free = {path: lab_rig.PARAMETER_RANGES[path] for path in lab_rig.FREE}
-    start = with_values(lab_rig.build_run(second, True, rig), found.values)
+    start = with_values(lab_rig.build_run(second, True, rig), fit.values)
     other = fit_record(start, free, second, starts=[{}, *lab_rig.STARTS[1:]])
     rows = []
-    for name, one in (("experiment 1", found), ("experiment 2", other)):
-        errors = [compare_with_record(with_values(lab_rig.build_run(record, True, rig), one.values), record)
+    for name, result in (("experiment 1", fit), ("experiment 2", other)):
+        errors = [compare_with_record(with_values(lab_rig.build_run(record, True, rig), result.values), record)
                   for record in (first, second)]  # fmt: skip
-        deviations = one.uncertainty.deviations
+        deviations = result.uncertainty.deviations
         rows.append({
             "fitted to": name,
             **{path.rpartition(".")[2]: f"{float(value):.4g} +- {deviations[path]:.1g}"
-               for path, value in one.values.items()},
+               for path, value in result.values.items()},
             "wheel 1 [%]": errors[0].wheel_rms_percent, "wheel 2 [%]": errors[1].wheel_rms_percent,
             "cycles 2": errors[1].cycles, "stop 1 [s]": record.format_time(errors[0].stop_time),
             "stop 2 [s]": record.format_time(errors[1].stop_time),
@@ -379,16 +379,16 @@ def loop_in(around: Mapping[str, Any], parts: Mapping[str, Any]) -> Loop:
     """The loop of a controller in its surroundings, from 1,700 rpm or 50 km/h to 5 km/h."""
     around = dict(around)
     period = around.pop("period")
-    given = dict(parts) if isinstance(around["plant"], MirroredRig) else as_command(parts)
-    inner = given.pop("controller")
+    commanded = dict(parts) if isinstance(around["plant"], MirroredRig) else as_command(parts)
+    inner = commanded.pop("controller")
     if isinstance(windup := getattr(inner, "antiwindup", None), BackCalculation):  # unstable if faster than the samples
         inner = dataclasses.replace(
             inner, antiwindup=dataclasses.replace(windup, tracking_time=max(float(windup.tracking_time), period))
         )
     controller = Sampled(controller=inner, period=period)
-    if isinstance(given["reference"], LimitedSlip):
-        given["reference"] = dataclasses.replace(given["reference"], period=period)
-    return braking(**{**around, **given, "controller": controller, "stop": SpeedReached(speed=5 / 3.6)})
+    if isinstance(commanded["reference"], LimitedSlip):
+        commanded["reference"] = dataclasses.replace(commanded["reference"], period=period)
+    return braking(**{**around, **commanded, "controller": controller, "stop": SpeedReached(speed=5 / 3.6)})
 
 
 def old_controllers(config: Config, rig: LabRig, dead: DeadTime) -> list[dict[str, Any]]:
@@ -432,10 +432,10 @@ def tuned_pi(config: Config, loop: Loop, over: Mapping[str, Any]) -> tuple[tuple
     return (float(kp[best]), float(ki[best])), float(iae.mean(axis=1)[best])
 
 
-def new_controllers(config: Config, rig: LabRig, dead: DeadTime, found: Identified) -> list[dict[str, Any]]:
+def new_controllers(config: Config, rig: LabRig, dead: DeadTime, fit: Identified) -> list[dict[str, Any]]:
     """A PI tuned on the mask, on the identified rig, and on draws of its parameters, each judged on the draws."""
-    names, draws = list(found.uncertainty.names), np.random.default_rng(0).multivariate_normal(
-        [float(found.values[name]) for name in found.uncertainty.names], found.uncertainty.covariance, config.draws
+    names, draws = list(fit.uncertainty.names), np.random.default_rng(0).multivariate_normal(
+        [float(fit.values[name]) for name in fit.uncertainty.names], fit.uncertainty.covariance, config.draws
     )  # fmt: skip
     of_loop = {name.removeprefix("loop."): draws[:, i] for i, name in enumerate(names) if name != "counter_lag"}
     slope = of_loop["plant.brake_gain"] / (1 - float(rig.brake_threshold))
@@ -452,10 +452,10 @@ def new_controllers(config: Config, rig: LabRig, dead: DeadTime, found: Identifi
         judged = pi_loop(rig, holds, dead, gains)
         solver = FixedStep(step=config.controllers_step, duration=6.0)
         runs = run_batch(judged, Batch(of_loop), solver, BRAKING, accepted=True)
-        own = measure(pi_loop(plant, holds, actuator, gains), solver, BRAKING).metrics
+        nominal = measure(pi_loop(plant, holds, actuator, gains), solver, BRAKING).metrics
         iaes = np.asarray(runs.metrics["iae"])
         rows.append({"controller": name, "kp, ki": f"{gains[0]:.3g}, {gains[1]:.3g}", "IAE where tuned [s]": iae,
-                     "overshoot there [%]": 100 * float(own["overshoot"]),
+                     "overshoot there [%]": 100 * float(nominal["overshoot"]),
                      "IAE on the draws, mean [s]": float(iaes.mean()), "worst [s]": float(iaes.max()),
                      "overshoot, worst [%]": 100 * float(np.max(np.asarray(runs.metrics["overshoot"]))),
                      "distance, mean [m]": float(np.mean(np.asarray(runs.metrics["stop_distance"])))})  # fmt: skip
@@ -475,7 +475,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
     """Run, print, save; returns the results by part."""
     config = config or Config()
     data = None if config.data is None else pathlib.Path(config.data)
-    first, second = (measured_rig.read_record(one, data) for one in measured_rig.EXPERIMENTS)
+    first, second = (measured_rig.read_record(name, data) for name in measured_rig.EXPERIMENTS)
     rig = lab_rig.build_rig(lab_rig.fit_coasting())
 
     @functools.cache
@@ -506,7 +506,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; all without one")
     parser.add_argument("--data", help="folder with finer readings than the packaged ones")
-    given = parser.parse_args()
-    if unknown := [name for name in given.parts if name not in PARTS]:
+    options = parser.parse_args()
+    if unknown := [name for name in options.parts if name not in PARTS]:
         parser.error(f"PART = {unknown[0]!r} is unknown; known are {', '.join(PARTS)}")
-    main(Config(data=given.data, parts=tuple(given.parts)))
+    main(Config(data=options.data, parts=tuple(options.parts)))

@@ -24,10 +24,14 @@ def seen(config: Any, loop: Loop, mass: float, speed: float) -> Run:
     return rollout(replace(loop, {"plant.mass": mass, "initial.speed": speed / KMH}), solver, BRAKING)
 
 
-def figures(config: Any, found: Tuned, those: dict[str, tuple[Loop, str]]) -> dict[str, Any]:
+def figures(config: Any, tuning: Tuned, those: dict[str, tuple[Loop, str]]) -> dict[str, Any]:
     """All masses before and after; four controllers and their torque; and how the tuning went."""
     both = {f"before: {PUBLISHED}": those[PUBLISHED][0], "after: tuned by gradients": those[CURE][0]}
-    return {"masses": all_masses(config, both), "cure": before_and_after(config, those), "tuning": tuning_figure(found)}
+    return {
+        "masses": all_masses(config, both),
+        "cure": before_and_after(config, those),
+        "tuning": tuning_figure(tuning),
+    }
 
 
 def all_masses(config: Any, loops: Mapping[str, Loop]) -> Any:
@@ -37,8 +41,8 @@ def all_masses(config: Any, loops: Mapping[str, Loop]) -> Any:
     title = f"Slip of a rig whose mass nobody knows: {MASSES} masses from {STARTS} speeds, 20 to 50 km/h"
     figure, axes = plot.sheet(1, len(loops), title=title, size=(5.2, 3.3), sharex=True, sharey=True)
     norm, colours = Normalize(low, high), colormaps["viridis"]
-    for i, (ax, (name, one)) in enumerate(zip(axes, loops.items(), strict=True)):
-        run = run_batch(one, lanes, FixedStep(config.step, config.duration, every=4), BRAKING, trajectories=True)
+    for i, (ax, (name, loop)) in enumerate(zip(axes, loops.items(), strict=True)):
+        run = run_batch(loop, lanes, FixedStep(config.step, config.duration, every=4), BRAKING, trajectories=True)
         sample, masses = run.trajectory.sample, lanes.values["plant.mass"]
         shown = np.asarray(sample.t)[0] <= UNTIL
         for mass, slip in zip(masses, np.asarray(sample.output.slip), strict=True):
@@ -83,12 +87,12 @@ def before_and_after(config: Any, those: dict[str, tuple[Loop, str]]) -> Any:
     return figure
 
 
-def tuning_figure(found: Tuned) -> Any:
+def tuning_figure(tuning: Tuned) -> Any:
     """Objective, gradient and violation over the gradients that were computed."""
     figure, axes = plot.sheet(1, 3, title="How the tuning went", size=(4.4, 3.2))
-    n = [p.evaluations for p in found.history]
+    n = [p.evaluations for p in tuning.history]
     for ax, (name, unit) in zip(axes, {"objective": "IAE [s]", "gradient": "", "violation": ""}.items(), strict=True):
-        ax.plot(n, [getattr(p, name) for p in found.history], "o-", markersize=3, color=plot.COLOURS[0])
+        ax.plot(n, [getattr(p, name) for p in tuning.history], "o-", markersize=3, color=plot.COLOURS[0])
         if name == "gradient":
             plot.make_logarithmic(ax, "y")
         plot.label_axes(ax, "gradients computed", f"{name} {unit}")

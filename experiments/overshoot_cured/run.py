@@ -80,8 +80,8 @@ class Config:
 def holding(config: Config) -> float:
     """Return tau* of the known mass [N m]."""
     rig = MirroredRig(mass=config.known_mass)
-    there = rig.output(rig.start(BrakeStart(speed=config.tuned_speeds[-1] / KMH, slip=config.slip)))
-    return float(rig.holding(there, config.slip))
+    output = rig.output(rig.start(BrakeStart(speed=config.tuned_speeds[-1] / KMH, slip=config.slip)))
+    return float(rig.holding(output, config.slip))
 
 
 def loop(config: Config, controller: Any, time_constant: float = 0.0, *, exact: bool = False) -> Loop:
@@ -157,11 +157,11 @@ def lmi_gains(config: Config) -> np.ndarray:
 
 def best_lmi(config: Config, batch: Batch) -> tuple[float, float]:
     """Return the one of these gains that overshoots least on the rig."""
-    gains, one = lmi_gains(config), loop(config, StateFeedback())
+    gains, template = lmi_gains(config), loop(config, StateFeedback())
     solver = FixedStep(step=config.step, duration=config.duration)
 
     def brake(gain: Any) -> Run:
-        return run_batch(replace(one, {"controller.controller.gain": gain}), batch, solver, BRAKING)
+        return run_batch(replace(template, {"controller.controller.gain": gain}), batch, solver, BRAKING)
 
     metrics = jax.device_get(jax.jit(jax.vmap(brake))(gains)).metrics
     worst = np.nan_to_num(metrics["overshoot"].max(axis=1), nan=np.inf)
@@ -278,9 +278,9 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
     record.print_rows("Weak spots: worst overshoot [%] over the same box where one thing is wrong", spots)
     asked_for = asked(config, tuning.loop)
     cure = {**summary(config, tuning, proofs["the cure"]), "torque asked for [N m]": asked_for}
-    wanted = [{"starts": name, "least": low, "greatest": high} for name, (low, high) in asked_for.items()]
+    demands = [{"starts": name, "least": low, "greatest": high} for name, (low, high) in asked_for.items()]
     record.print_rows(
-        f"Torque [N m] that the cure asks for; {config.torque[0]:g} to {config.torque[1]:g} is what it gets", wanted
+        f"Torque [N m] that the cure asks for; {config.torque[0]:g} to {config.torque[1]:g} is what it gets", demands
     )
     results = {"table": rows, "weak_spots": spots, "cure": cure}
     return record.experiment(config, results, figures(config, tuning, controllers))

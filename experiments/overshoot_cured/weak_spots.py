@@ -128,6 +128,6 @@ def unlimited(loop: Loop) -> Loop:
 def torques(loop: Loop, box: Box, solver: FixedStep) -> tuple[float, float]:
     """Least and greatest torque asked for over the box [N m], before the limits."""
     free = unlimited(loop)
-    asked = jax.jit(jax.vmap(lambda values: rollout(replace(free, values), solver).trajectory.sample.command))
-    command = np.asarray(asked(box.lanes()))
+    commands = jax.jit(jax.vmap(lambda values: rollout(replace(free, values), solver).trajectory.sample.command))
+    command = np.asarray(commands(box.lanes()))
     return float(command.min()), float(command.max())

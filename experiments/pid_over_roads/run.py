@@ -46,7 +46,7 @@ class Config(Roads):
 
     candidates: int = 4096  # gains screened on the paper's own road,
     near: float = 0.0028  # those this close to its bound
-    kept: int = 64  # (the nearest of them) also on
+    nearest: int = 64  # (the nearest of them) also on
     few: int = 64  # roads of the family
     arming: float = 0.5  # m/s^2; at the estimator's 3 m/s^2 nothing would be found on roads below 0.3
     own_share: float = 0.2  # of the objective: the paper's own car and road
@@ -65,7 +65,7 @@ class Config(Roads):
     )
     screening: float = 5e-4  # s, step on the paper's own road
     step: float = 2e-3  # s
-    fine: float = 1e-3  # s, for judging
+    judged_step: float = 1e-3  # s, for judging
     stop: float = 2.0  # m/s; from there at the last deceleration. Slower, these steps are not stable for large kp
     longest: float = 40.0  # s
     own_step: float = 5e-5  # s, on the paper's own road, to 0.05 m/s
@@ -122,7 +122,7 @@ def screened(config: Config, loop: Loop) -> Loop:
     far = (
         distances(own_loop, gains, FixedStep(step=config.screening, duration=4.0)) / slip_estimator.BOUNDS["90 N m"] - 1
     )
-    near = np.argsort(far)[: min(config.kept, int(np.sum(far < config.near)))]
+    near = np.argsort(far)[: min(config.nearest, int(np.sum(far < config.near)))]
     few = family(config, config.few, config.seed)
     lanes = {path: np.repeat(column[near], config.few) for path, column in gains.items()}
     lanes |= {path: np.concatenate([column] * len(near)) for path, column in few.values.items()}
@@ -144,7 +144,7 @@ def judged(config: Config, loop: Loop, unseen: Family, noise: float = 0.0) -> di
     if noise:
         loop = dataclasses.replace(loop, sensor=Noise(deceleration=noise, period=1e-3))
         keys = np.arange(len(unseen.time))
-    solver = FixedStep(step=config.fine, duration=config.longest)
+    solver = FixedStep(step=config.judged_step, duration=config.longest)
     runs = jax.device_get(run_batch(loop, Batch(unseen.values, keys), solver, MEASURED))
     return {**runs.metrics, "stopped": runs.stopped, "diverged": runs.diverged}
 
@@ -154,7 +154,7 @@ def compared(config: Config, name: str, before: Any, after: Any, unseen: Family)
     both = before["stopped"] & ~before["diverged"] & after["stopped"] & ~after["diverged"]
     gain, half = interval((1 - after["stop_distance"] / before["stop_distance"])[both], config.confidence)
     pair = (("before", before), ("after", after))
-    relative = {key: kept(one["stop_distance"] / unseen.distance, both) for key, one in pair}
+    relative = {key: kept(result["stop_distance"] / unseen.distance, both) for key, result in pair}
     return {
         "control": name,
         "paper's gains: distance/shortest": float(relative["before"].mean()),

@@ -118,7 +118,7 @@ def tube(config: Config) -> tuple[Any, Any]:
     if proof.verdict != "proved":
         raise SystemExit("the tube is not proved within the budget")
     grid = np.arange(0.0, config.shown, 1e-3)
-    least, greatest = np.full(len(grid), np.inf), np.full(len(grid), -np.inf)
+    lower, upper = np.full(len(grid), np.inf), np.full(len(grid), -np.inf)
     cells = [
         np.array([[a, min(a + config.cell, cell[0, 1])]])
         for cell in proof.cells
@@ -127,17 +127,17 @@ def tube(config: Config) -> tuple[Any, Any]:
     prover = Prover(proof.equations, ("slip",), config.shown, longest=config.step)
     prover.choose_weights(np.array([np.mean(config.mass)]))
     for cell in cells:
-        found = prover.follow(cell)
-        first = np.searchsorted(grid, found.time[:, 0])
-        last = np.searchsorted(grid, found.time[:, 1], side="right")
-        for a, b, x, y in zip(first, last, found.lower[:, 0], found.upper[:, 0], strict=True):
-            least[a:b], greatest[a:b] = np.minimum(least[a:b], x), np.maximum(greatest[a:b], y)
+        flow = prover.follow(cell)
+        first = np.searchsorted(grid, flow.time[:, 0])
+        last = np.searchsorted(grid, flow.time[:, 1], side="right")
+        for a, b, x, y in zip(first, last, flow.lower[:, 0], flow.upper[:, 0], strict=True):
+            lower[a:b], upper[a:b] = np.minimum(lower[a:b], x), np.maximum(upper[a:b], y)
     masses = np.random.default_rng(0).uniform(*config.mass, config.runs)
     solver = d.FixedStep(1e-4, config.shown, every=10)
     with jax.enable_x64(True):  # a run in single precision leaves the tube by its rounding, 1e-6
         loops = (d.replace(loop, {"plant.mass": mass}) for mass in masses)
-        slips = [np.asarray(d.rollout(one, solver).trajectory.sample.output.slip) for one in loops]
-    return np.stack([grid, least, greatest], 1), np.stack(slips)[:, : len(grid)]
+        slips = [np.asarray(d.rollout(loop, solver).trajectory.sample.output.slip) for loop in loops]
+    return np.stack([grid, lower, upper], 1), np.stack(slips)[:, : len(grid)]
 
 
 def draw_tube(config: Config, bounds: Any, slips: Any) -> pathlib.Path:
@@ -145,11 +145,11 @@ def draw_tube(config: Config, bounds: Any, slips: Any) -> pathlib.Path:
     from diffabs.output.plot.style import COLOURS, GREY, label_axes, save_figure, sheet
 
     figure, axes = sheet(title="Published gain with torque limits: every mass 5.3 to 6.2 kg", size=(7.0, 3.6))
-    times, least, greatest = bounds.T
+    times, lower, upper = bounds.T
     for i, slip in enumerate(slips):
         label = f"{len(slips):,} runs" if not i else None
         axes[0].plot(times[: len(slip)], slip, color=GREY, linewidth=0.2, label=label)
-    for bound, label in ((least, "proved tube"), (greatest, None)):
+    for bound, label in ((lower, "proved tube"), (upper, None)):
         axes[0].plot(times, bound, color=COLOURS[0], linewidth=1.0, label=label)
     axes[0].axhline(config.slip, color="black", linestyle=":", linewidth=0.8, label="target")
     label_axes(axes[0], "t [s]", "slip [1]", legend=False)

@@ -33,8 +33,8 @@ class Config:
 
 def loops(config: Config, speed: str) -> dict[str, Loop]:
     """Return the committed loops of one kind of speed, by the name of their file."""
-    found = sorted(pathlib.Path(config.folder).glob(f"{speed}-*.json"))
-    those = {path.stem.removeprefix(f"{speed}-"): path for path in found if config.only in path.stem}
+    files = sorted(pathlib.Path(config.folder).glob(f"{speed}-*.json"))
+    those = {path.stem.removeprefix(f"{speed}-"): path for path in files if config.only in path.stem}
     return {name: loop_of(json.loads(path.read_text())) for name, path in those.items()}
 
 
@@ -48,32 +48,32 @@ def judged(config: Config, speed: str, name: str, loop: Loop) -> dict[str, Any]:
     """Return the judgement of a loop on corners and points of the box, and of a tuned estimator that never restarts."""
     tuned = name.startswith("tuned")
     samples = config.judging.samples if tuned else config.judging.fewer
-    found = {
+    results = {
         "corners": in_corners(loop, config.box, config.fixed, speed, config.judging),
         "box": on_samples(loop, config.box, config.fixed, speed, config.judging, samples),
     }
     if name == "tuned-cvar" and speed == ESTIMATED:
         points = drawn(config.box, speed, samples, config.judging.seed)
         never = runs(replace(loop, {"sensor.blocks.4.rest": RAREST}), points, config.judging, config.judging.seed)
-        near = runs(loop, near_corner(config, speed, found["corners"]["at"]), config.judging, config.judging.seed + 4)
-        found["near the worst corner, overshoot [%]"] = 100 * float(near["overshoot"].max())
-        found["without rest, does not stop"] = chance(~never["stopped"], config.judging.confidence)
-    return found
+        near = runs(loop, near_corner(config, speed, results["corners"]["at"]), config.judging, config.judging.seed + 4)
+        results["near the worst corner, overshoot [%]"] = 100 * float(near["overshoot"].max())
+        results["without rest, does not stop"] = chance(~never["stopped"], config.judging.confidence)
+    return results
 
 
-def row(one: dict[str, Any]) -> dict[str, Any]:
+def row(result: dict[str, Any]) -> dict[str, Any]:
     """Return a line of the table: percentages, and times in s."""
-    box, proof = one["box"], one["proof"]
-    rate, settling, off = proof.get("decay [1/s]"), box["settling [s]"], box["deviation above the floor [%]"]
+    box, proof = result["box"], result["proof"]
+    rate, settling, deviation = proof.get("decay [1/s]"), box["settling [s]"], box["deviation above the floor [%]"]
     return {
         "meets": "yes" if box["meets the requirement"] else "no",
         "deviation near the floor": f"{box['deviation near the floor']['percent']:.1f}",
-        "above it, median, 95 %": f"{off['median']:.1f}, {off['95 %']:.1f}",
-        "overshoot: worst corner, worst point": f"{one['corners']['overshoot [%]']:.1f}, "
+        "above it, median, 95 %": f"{deviation['median']:.1f}, {deviation['95 %']:.1f}",
+        "overshoot: worst corner, worst point": f"{result['corners']['overshoot [%]']:.1f}, "
         f"{box['overshoot [%]']['greatest']:.1f}",
-        "near the worst corner": one.get("near the worst corner, overshoot [%]", ""),
+        "near the worst corner": result.get("near the worst corner, overshoot [%]", ""),
         "locks, not stopped": f"{box['locks']['count']}, {box['does not stop']['count']}",
-        "not stopped without rest": one.get("without rest, does not stop", {}).get("count", ""),
+        "not stopped without rest": result.get("without rest, does not stop", {}).get("count", ""),
         "settled within 0.25 s": f"{box['settled within 0.25 s']['percent']:.1f}",
         "settled, median, 95 %": f"{seconds(settling['median'])}, {seconds(settling['95 %'])}",
         "certificate": proof["said"] + ("" if rate is None else f", {rate:.3g} /s"),
@@ -90,8 +90,10 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
         proved = proofs(config.proving, config.box, config.fixed, those)
         told(f"{speed}, proofs")
         results[speed] = {}
-        for name, one in those.items():
-            results[speed][name] = judged(config, speed, name, one) | {"proof": proved[name]}
+        for name, loop in those.items():
+            results[speed][name] = judged(config, speed, name, loop) | {"proof": proved[name]}
             told(f"{name}: {row(results[speed][name])}")
-        record.print_rows(f"Speed {speed}", [{"controller": name, **row(one)} for name, one in results[speed].items()])
+        record.print_rows(
+            f"Speed {speed}", [{"controller": name, **row(result)} for name, result in results[speed].items()]
+        )
     return record.experiment(config, results, {})

@@ -93,7 +93,7 @@ def columns(points: dict[str, np.ndarray]) -> dict[str, Any]:
     h, c = at["height"], at["place"]
     road = {"w1": RIG.w1 * h / c, "w2": RIG.w2 * h / c**2, "w3": RIG.w3 * h / c**3, "w4": RIG.w4 * h}
     road["a"] = RIG.a * c**RIG.q
-    found = {
+    values = {
         **{path: at[name] for name, path in SENSOR.items() if name in points},
         "plant.mass": at["mass"],
         "plant.wheel_inertia": INERTIA * at["inertia"],
@@ -102,8 +102,8 @@ def columns(points: dict[str, np.ndarray]) -> dict[str, Any]:
         "controller.delay": at["delay"],
         **{f"plant.road.{name}": value for name, value in road.items()},
     }
-    count = max(len(value) for value in found.values())
-    return {path: np.broadcast_to(value, count) for path, value in found.items()}
+    count = max(len(value) for value in values.values())
+    return {path: np.broadcast_to(value, count) for path, value in values.items()}
 
 
 def batch(values: dict[str, Any], seed: int) -> Batch:

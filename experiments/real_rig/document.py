@@ -95,11 +95,11 @@ def document(loop: Loop) -> dict[str, Any]:
 
 def loop_of(document: dict[str, Any]) -> Loop:
     """Return the loop of a document for the judgement, with its noises and the quantisation of the wheel's speed."""
-    kinds, values = document["kinds"], {path: one["value"] for path, one in document["parameters"].items()}
+    kinds, values = document["kinds"], {path: parameter["value"] for path, parameter in document["parameters"].items()}
     windup = {}
     if any(path.startswith("controller.controller.antiwindup") for path in values):
         windup = {"antiwindup": controllers.BackCalculation()}
     controller = getattr(controllers, kinds["controller"])(**windup)
     speed = ESTIMATED if kinds["speed"] == "SpeedEstimator" else KNOWN
-    one = loop(Fixed(), controller, speed, getattr(references, kinds["reference"])())
-    return replace(one, {path: np.array(value) for path, value in values.items()})
+    template = loop(Fixed(), controller, speed, getattr(references, kinds["reference"])())
+    return replace(template, {path: np.array(value) for path, value in values.items()})

@@ -53,7 +53,7 @@ SEEDS = 2
 def degradation(loop: Loop, speed: str, config: Judging, count: int) -> Maps:
     """Return the overshoot [%] over pairs of parameters around the nominal point (count, count): the worst of SEEDS
     noises, drawn for each point."""
-    found = {}
+    maps = {}
     for pair in PAIRS[speed]:
         x, y = np.linspace(*pair.x_range, count), np.linspace(*pair.y_range, count)
         grid = np.meshgrid(x, y, range(SEEDS), indexing="ij")
@@ -64,13 +64,13 @@ def degradation(loop: Loop, speed: str, config: Judging, count: int) -> Maps:
         worst = runs(loop, points, config, config.seed + 3)
         overshoot = worst["overshoot"].reshape(grid[0].shape).max(axis=2)
         locked = worst["locked"].reshape(grid[0].shape).max(axis=2)
-        found[f"{pair.x}, {pair.y}"] = {
+        maps[f"{pair.x}, {pair.y}"] = {
             "x": x.tolist(),
             "y": y.tolist(),
             "overshoot [%]": np.nan_to_num(100 * overshoot, posinf=1e4).tolist(),
             "locks": (locked > 0).tolist(),
         }
-    return found
+    return maps
 
 
 def _mine(name: str, speed: str) -> bool:
@@ -89,14 +89,14 @@ def map_figure(maps: Maps, speed: str, box: Box) -> Any:
         size=(4.8, 3.8),
     )
     for ax, pair in zip(axes, PAIRS[speed], strict=True):
-        one = maps[f"{pair.x}, {pair.y}"]
-        values = np.clip(np.array(one["overshoot [%]"]), 0.0, 100.0)
+        panel = maps[f"{pair.x}, {pair.y}"]
+        values = np.clip(np.array(panel["overshoot [%]"]), 0.0, 100.0)
         (x_label, x_scale), (y_label, y_scale) = AXES[pair.x], AXES[pair.y]
-        x, y = x_scale * np.array(one["x"]), y_scale * np.array(one["y"])
+        x, y = x_scale * np.array(panel["x"]), y_scale * np.array(panel["y"])
         filled = ax.contourf(x, y, values.T, levels=LEVELS, cmap="viridis", norm=BoundaryNorm(LEVELS, 256))
         figure.colorbar(filled, ax=ax)
-        if np.any(one["locks"]):
-            ax.contour(x, y, np.array(one["locks"], float).T, levels=[0.5], colors="red")
+        if np.any(panel["locks"]):
+            ax.contour(x, y, np.array(panel["locks"], float).T, levels=[0.5], colors="red")
         (x0, x1), (y0, y1) = x_scale * np.array(getattr(box, pair.x)), y_scale * np.array(getattr(box, pair.y))
         ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor="white", linewidth=1.5))
         plot.label_axes(ax, x_label, y_label, legend=False)
@@ -108,10 +108,10 @@ def distributions(ones: dict[str, Loop], speed: str, box: Box, fixed: Fixed, con
     points = drawn(box, speed, count, config.seed)
     figure, (ax,) = plot.sheet(1, 1, title=f"Overshoot over the box, speed {speed}", size=(7.0, 4.6))
     share = 1 - (np.arange(count) + 0.5) / count
-    least = 100 * np.sort(floor(points, speed, fixed))
-    ax.plot(least, share, color="black", linestyle=":", label="floor: the error of the speed alone")
-    for i, (name, one) in enumerate(ones.items()):
-        values = 100 * np.sort(runs(one, points, config, config.seed)["overshoot"])
+    floors = 100 * np.sort(floor(points, speed, fixed))
+    ax.plot(floors, share, color="black", linestyle=":", label="floor: the error of the speed alone")
+    for i, (name, loop) in enumerate(ones.items()):
+        values = 100 * np.sort(runs(loop, points, config, config.seed)["overshoot"])
         style = {"color": plot.COLOURS[i % len(plot.COLOURS)], "linestyle": plot.DASHES[i % len(plot.DASHES)]}
         ax.plot(np.clip(values, 0, 400), share, label=name, **style)
     ax.set_yscale("log")
@@ -128,12 +128,12 @@ def traces(ones: dict[str, Loop], speed: str) -> Any:
     titles = ("nominal, 50 km/h", "70 km/h and much wrong")
     lanes = batch(columns({name: np.array([NOMINAL[name], x]) for name, x in wrong.items()}), 7)
     figure, axes = plot.sheet(2, len(titles), title=f"Slip and torque, speed {speed}", size=(6.0, 3.2))
-    for i, (name, one) in enumerate(ones.items()):
-        run = run_batch(one, lanes, FixedStep(step=1e-3, duration=2.6, kinks=False), trajectories=True)
-        seen = jax.device_get(run.trajectory)
+    for i, (name, loop) in enumerate(ones.items()):
+        run = run_batch(loop, lanes, FixedStep(step=1e-3, duration=2.6, kinks=False), trajectories=True)
+        trajectory = jax.device_get(run.trajectory)
         style = {"color": plot.COLOURS[i % len(plot.COLOURS)], "linestyle": plot.DASHES[i % len(plot.DASHES)]}
         for column in range(len(titles)):
-            sample, on = jax.tree.map(lambda x, at=column: x[at], (seen.sample, seen.running))
+            sample, on = jax.tree.map(lambda x, at=column: x[at], (trajectory.sample, trajectory.running))
             axes[column].plot(sample.t[on], sample.output.slip[on], label=name, linewidth=1.1, **style)
             axes[len(titles) + column].plot(sample.t[on], sample.control[on], linewidth=0.9, **style)
     for column, title in enumerate(titles):
@@ -144,10 +144,10 @@ def traces(ones: dict[str, Loop], speed: str) -> Any:
     return figure
 
 
-def descents(found: dict[str, Any]) -> Any:
+def descents(stages_by_speed: dict[str, Any]) -> Any:
     """How the tunings went: all starts on few lanes, the best of them on many."""
-    figure, axes = plot.sheet(1, len(found), title="How the tuning went", size=(5.0, 3.6))
-    for ax, (speed, stages) in zip(axes, found.items(), strict=True):
+    figure, axes = plot.sheet(1, len(stages_by_speed), title="How the tuning went", size=(5.0, 3.6))
+    for ax, (speed, stages) in zip(axes, stages_by_speed.items(), strict=True):
         for i, (stage, tuned) in enumerate(stages.items()):
             for j, start in enumerate(tuned.starts):
                 points = start.history

@@ -42,8 +42,8 @@ def error(points: dict[str, np.ndarray], speed: str, fixed: Fixed, t: np.ndarray
     alone makes it."""
     if speed == KNOWN:
         return points["last"] + (points["first"] - points["last"]) * np.exp(-t / fixed.drift)
-    left = points["speed"] / KMH - t * (points["speed"] - fixed.end) / KMH / stopping_time(points, fixed)
-    return -points["bias"] * t / left
+    remaining = points["speed"] / KMH - t * (points["speed"] - fixed.end) / KMH / stopping_time(points, fixed)
+    return -points["bias"] * t / remaining
 
 
 def floor(points: dict[str, np.ndarray], speed: str, fixed: Fixed, *, two_sided: bool = False) -> np.ndarray:
@@ -64,6 +64,6 @@ class Deviation(HeldValue):
 
     def update(self, memory: Memory, segment: Segment) -> Any:
         """The greater of that so far and that at the end of the step."""
-        off = segment.end.output.slip / segment.end.setpoint - 1
-        counts = jnp.where(segment.end.t >= HELD, larger(off, -off), off)
+        deviation = segment.end.output.slip / segment.end.setpoint - 1
+        counts = jnp.where(segment.end.t >= HELD, larger(deviation, -deviation), deviation)
         return larger(memory.held, counts)

@@ -84,12 +84,12 @@ def _block(loop: Loop, lanes: Batch, at: np.ndarray, config: Judging) -> Any:
 
 def spots(speed: str) -> dict[str, dict[str, np.ndarray]]:
     """Return the points of each weak spot by its name: all masses and speeds, with one deviation."""
-    mine = {name: at for name, at in SPOTS.items() if _fits(at, speed)}
+    deviations = {name: at for name, at in SPOTS.items() if _fits(at, speed)}
     axes = np.meshgrid(MASSES, SPEEDS, range(SEEDS), indexing="ij")
     mass, start, _ = (axis.ravel() for axis in axes)
     names = [name for name in NOMINAL if _fits({name: 0.0}, speed)]
     plain = {name: np.full(len(mass), NOMINAL[name]) for name in names} | {"mass": mass, "speed": start}
-    return {spot: plain | {name: np.full(len(mass), x) for name, x in at.items()} for spot, at in mine.items()}
+    return {spot: plain | {name: np.full(len(mass), x) for name, x in at.items()} for spot, at in deviations.items()}
 
 
 def _fits(at: dict[str, float], speed: str) -> bool:
@@ -127,12 +127,12 @@ def chance(happens: np.ndarray, confidence: float) -> dict[str, Any]:
 def on_samples(loop: Loop, box: Box, fixed: Fixed, speed: str, config: Judging, samples: int) -> dict[str, Any]:
     """Probabilities and quantiles on so many points of the box."""
     points = drawn(box, speed, samples, config.seed)
-    metrics, least = runs(loop, points, config, config.seed), floor(points, speed, fixed)
+    metrics, floors = runs(loop, points, config, config.seed), floor(points, speed, fixed)
     widest = 4 * max(map(abs, (*box.first, *box.last)))  # the floor of the box, of a known speed
     overshoot, lost = metrics["overshoot"], metrics["distance"] / shortest(points, fixed) - 1
-    off = metrics["deviation"] - floor(points, speed, fixed, two_sided=True)
-    fine = (metrics["locked"] == 0) & metrics["stopped"]
-    low = least > 0.01
+    deviation = metrics["deviation"] - floor(points, speed, fixed, two_sided=True)
+    sound = (metrics["locked"] == 0) & metrics["stopped"]
+    low = floors > 0.01
     row = {
         "overshoot > 1 %": chance(overshoot > 0.01, config.confidence),
         "overshoot > 5 %": chance(overshoot > 0.05, config.confidence),
@@ -140,13 +140,13 @@ def on_samples(loop: Loop, box: Box, fixed: Fixed, speed: str, config: Judging, 
         "does not stop": chance(~metrics["stopped"], config.confidence),
         "within 1.5 floors of the box": chance(overshoot <= ENOUGH * widest, config.confidence),
         "within 1.5 floors of its own, where that exceeds 1 %": chance(
-            overshoot[low] <= ENOUGH * least[low], config.confidence
+            overshoot[low] <= ENOUGH * floors[low], config.confidence
         ),
         "overshoot [%]": quantiles(100 * overshoot),
-        "above the floor [%]": quantiles(100 * (overshoot - least)),
-        "deviation above the floor [%]": quantiles(100 * off),
-        "deviation near the floor": chance(off <= NEAR, config.confidence),
-        "meets the requirement": bool(fine.all() and np.mean(off <= NEAR) >= REQUIRED),
+        "above the floor [%]": quantiles(100 * (overshoot - floors)),
+        "deviation above the floor [%]": quantiles(100 * deviation),
+        "deviation near the floor": chance(deviation <= NEAR, config.confidence),
+        "meets the requirement": bool(sound.all() and np.mean(deviation <= NEAR) >= REQUIRED),
         "settling [s]": quantiles(metrics["settling"]),
         "settled within 0.25 s": chance(metrics["settling"] <= HELD, config.confidence),
         "distance lost [%]": quantiles(100 * lost),
@@ -174,9 +174,9 @@ def against_truth(loop: Loop, points: Any, metrics: Any, config: Judging) -> dic
     of the wheel."""
     from experiments.real_rig.loops import with_truth
 
-    known = {name: value for name, value in points.items() if name != "bias"}
+    unbiased = {name: value for name, value in points.items() if name != "bias"}
     truth = runs(
-        with_truth(loop), known | {name: 0 * points["mass"] for name in ("first", "last")}, config, config.seed
+        with_truth(loop), unbiased | {name: 0 * points["mass"] for name in ("first", "last")}, config, config.seed
     )
     return quantiles(100 * (metrics["distance"] / truth["distance"] - 1))
 
@@ -184,12 +184,12 @@ def against_truth(loop: Loop, points: Any, metrics: Any, config: Judging) -> dic
 def in_corners(loop: Loop, box: Box, fixed: Fixed, speed: str, config: Judging) -> dict[str, Any]:
     """The worst of all corners, with a few noises each, and which it is."""
     points = corners(box, speed, config.corner_seeds)
-    metrics, least = runs(loop, points, config, config.seed + 2), floor(points, speed, fixed)
+    metrics, floors = runs(loop, points, config, config.seed + 2), floor(points, speed, fixed)
     worst = int(np.argmax(metrics["overshoot"]))
     return {
         "overshoot [%]": float(100 * metrics["overshoot"][worst]),
-        "floor there [%]": float(100 * least[worst]),
-        "above the floor, most [%]": float(100 * np.max(metrics["overshoot"] - least)),
+        "floor there [%]": float(100 * floors[worst]),
+        "above the floor, most [%]": float(100 * np.max(metrics["overshoot"] - floors)),
         "at": {name: float(value[worst]) for name, value in points.items()},
         "locks": int((metrics["locked"] > 0).sum()),
         "do not stop": int((~metrics["stopped"]).sum()),

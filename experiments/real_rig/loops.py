@@ -18,8 +18,8 @@ from experiments.real_rig.box import KMH, KNOWN, NOMINAL, Fixed
 def holding(fixed: Fixed) -> float:
     """Return tau* of the known mass [N m]."""
     rig = MirroredRig(mass=fixed.known_mass)
-    there = rig.output(rig.start(BrakeStart(speed=NOMINAL["speed"] / KMH, slip=fixed.slip)))
-    return float(rig.holding(there, fixed.slip))
+    output = rig.output(rig.start(BrakeStart(speed=NOMINAL["speed"] / KMH, slip=fixed.slip)))
+    return float(rig.holding(output, fixed.slip))
 
 
 def sensor(fixed: Fixed, speed: str, estimator: Any = None, *, smooth: bool = False) -> Series:

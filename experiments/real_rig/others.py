@@ -89,8 +89,8 @@ def cma_es(score: Score, loop: Loop, free: Free, config: Others) -> Loop:
     options = {"maxfevals": config.evaluations, "verbose": -9, "seed": config.seed, "verb_log": 0}
     search = cma.CMAEvolutionStrategy(coordinates.place(loop), 0.5, options)
     while not search.stop():
-        asked = search.ask()
-        search.tell(asked, [score(_at(loop, coordinates, z)) for z in asked])
+        population = search.ask()
+        search.tell(population, [score(_at(loop, coordinates, z)) for z in population])
     return _at(loop, coordinates, search.result.xbest)
 
 
@@ -106,9 +106,9 @@ def designs(config: Others, box: Box, fixed: Fixed) -> dict[str, list[np.ndarray
     """
     speeds = (fixed.end / KMH, box.speed[1] / KMH)
     narrow = {"plant.mass": box.mass, "speed": speeds}
-    seen = 1 + box.first[1]
+    factor = 1 + box.first[1]
     wide = narrow | {
-        "plant.wheel_inertia": (INERTIA * box.inertia[0] / seen, INERTIA * box.inertia[1] * seen),
+        "plant.wheel_inertia": (INERTIA * box.inertia[0] / factor, INERTIA * box.inertia[1] * factor),
         "plant.road.w4": tuple(RIG.w4 * x for x in box.height),
         "plant.road.a": tuple(RIG.a * x**RIG.q for x in box.place),
     }
@@ -116,12 +116,12 @@ def designs(config: Others, box: Box, fixed: Fixed) -> dict[str, list[np.ndarray
     plain, ranged = polytope(model, narrow), polytope(model, wide)
     lq = [Spec(Q=q, R=1.0) for q in itertools.product(*config.weights)]
     fast = [Spec(Q=(1e4, 1e2), R=1.0, decay=rate) for rate in config.decays]
-    kept = [Spec(Q=(1e4, 1e2), R=1.0, l2=L2Gain(output=[[0.0, 1.0]], bound=bound)) for bound in config.bounds]
+    specs = [Spec(Q=(1e4, 1e2), R=1.0, l2=L2Gain(output=[[0.0, 1.0]], bound=bound)) for bound in config.bounds]
     return {
         "LMI": list(_gains(plain, lq)),
         "LMI, wide": list(_gains(ranged, lq)),
         "decay, wide": list(_gains(ranged, fast)),
-        "H-infinity, wide": list(_gains(ranged, kept)),
+        "H-infinity, wide": list(_gains(ranged, specs)),
     }
 
 

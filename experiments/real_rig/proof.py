@@ -76,10 +76,10 @@ def models(
         slip=fixed.slip, actuator=Lag(time_constant=box.lag[0]), sampling=Sampling(period=fixed.period, delay=0.0)
     )
     low, high = fixed.end / KMH, box.speed[1] / KMH
-    seen = 1 + box.first[1] if kind == "fixed" else 1.0
+    factor = 1 + box.first[1] if kind == "fixed" else 1.0
     over = {
         "plant.mass": box.mass,
-        "plant.wheel_inertia": (INERTIA * box.inertia[0] / seen, INERTIA * box.inertia[1] * seen),
+        "plant.wheel_inertia": (INERTIA * box.inertia[0] / factor, INERTIA * box.inertia[1] * factor),
         "plant.road.w4": tuple(RIG.w4 * x for x in box.height),
         "speed": (low, high),
         **({"slip": config.slips} if config.slips[0] < config.slips[1] else {}),
@@ -99,13 +99,13 @@ def covering(config: Proving, box: Box, fixed: Fixed, kind: str, cell: dict[str,
         return polytope(model, over, grid=config.grid)
     ends = np.geomspace(*over["speed"], config.speeds + 1).tolist()
     hulls = [polytope(model, over | {"speed": pair}, grid=config.grid) for pair in itertools.pairwise(ends)]
-    a, b = (np.concatenate([getattr(one, name) for one in hulls]) for name in ("A", "B"))
+    a, b = (np.concatenate([getattr(hull, name) for hull in hulls]) for name in ("A", "B"))
     return Polytope(a, b, hulls[0].period, hulls[0].states)
 
 
 def proofs(config: Proving, box: Box, fixed: Fixed, ones: dict[str, Loop]) -> dict[str, dict[str, Any]]:
     """Return the proof of each loop: the number of cells with a common P, and the slowest decay that it proves."""
-    kinds = {name: found for name, one in ones.items() if (found := gain(one)) is not None}
+    kinds = {name: matrix for name, loop in ones.items() if (matrix := gain(loop)) is not None}
     said: dict[str, dict[str, Any]] = {
         name: {"said": "not linear", "cells": 0, "of": 0} for name in ones if name not in kinds
     }
@@ -126,9 +126,9 @@ def proofs(config: Proving, box: Box, fixed: Fixed, ones: dict[str, Loop]) -> di
 
 def _one(k: np.ndarray, those: list[tuple[Polytope, Polytope]], kind: str) -> dict[str, Any]:
     whole = np.concatenate([k, np.zeros(those[0][0].order - len(k))])
-    found = [certify(whole, vertices, fastest=True) for vertices, _ in those]
-    stable = [proof.quadratically_stable for proof in found]
-    rates = [proof.decay_rate for proof in found if proof.quadratically_stable]
+    certificates = [certify(whole, vertices, fastest=True) for vertices, _ in those]
+    stable = [proof.quadratically_stable for proof in certificates]
+    rates = [proof.decay_rate for proof in certificates if proof.quadratically_stable]
     sampled = [certify(whole, machines) for _, machines in those]
     worst = max(float(np.max(proof.frozen)) for proof in sampled)
     word = "proved" if all(stable) else "undecided"
@@ -140,12 +140,12 @@ def _one(k: np.ndarray, those: list[tuple[Polytope, Polytope]], kind: str) -> di
         "said": word,
         "cells": sum(s is True for s in stable),
         "cells in which machines have a common P": sum(proof.quadratically_stable is True for proof in sampled),
-        "of": len(found),
-        "decay [1/s]": min(rates) if len(rates) == len(found) else None,
+        "of": len(certificates),
+        "decay [1/s]": min(rates) if len(rates) == len(certificates) else None,
         "largest frozen |pole| of a machine": worst,
         "vertices": [vertices.vertices for vertices, _ in those],
         "machines": [machines.vertices for _, machines in those],
         "verified exactly": all(
-            proof.verified_exactly for proof, s in zip(found, stable, strict=True) if s is not None
+            proof.verified_exactly for proof, s in zip(certificates, stable, strict=True) if s is not None
         ),
     }

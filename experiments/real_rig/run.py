@@ -56,7 +56,9 @@ def cost(config: Config, stages: dict[str, Tuned], last: str) -> int:
     """Runs that a tuning took: of the starts, of CVaR, and of the stage that went on from there."""
     t = config.tuning
     lanes = {"starts": t.few} | dict.fromkeys(STAGES, t.lanes)
-    took = {name: lanes[name] * sum(one.history[-1].evaluations for one in stages[name].starts) for name in stages}
+    took = {
+        name: lanes[name] * sum(descent.history[-1].evaluations for descent in stages[name].starts) for name in stages
+    }
     return int(config.price * sum(took[name] for name in {"starts", "CVaR", last}))
 
 
@@ -71,18 +73,20 @@ def compared(
     """Return all loops of one kind of speed by name, with the runs behind each. All have the same estimated speed."""
     best: Any = stages["CVaR"].loop
     estimator = None if speed == KNOWN else best.sensor.blocks[-1]
-    found = contenders(config.others, config.fixed, speed, robust, estimator, scored(config, speed), report)
+    rivals = contenders(config.others, config.fixed, speed, robust, estimator, scored(config, speed), report)
     if "both sides" in stages:
         score = scored(config, speed, TWO_SIDED)
         pi, free = proportional_integral(config.others)
-        found["PI, CMA-ES, both sides"] = (
+        rivals["PI, CMA-ES, both sides"] = (
             cma_es(score, loop(config.fixed, pi, speed), free, config.others),
             score.rollouts,
         )
         report("PI, CMA-ES, both sides")
-    own = {name: (stages[stage].loop, cost(config, stages, stage)) for stage, name in STAGES.items() if stage in stages}
-    own = {BEFORE: (start(config.tuning, config.fixed, speed), 0)} | own
-    return found | {name: (quantised(one, config.fixed), runs) for name, (one, runs) in own.items()}
+    ours = {
+        name: (stages[stage].loop, cost(config, stages, stage)) for stage, name in STAGES.items() if stage in stages
+    }
+    ours = {BEFORE: (start(config.tuning, config.fixed, speed), 0)} | ours
+    return rivals | {name: (quantised(loop, config.fixed), runs) for name, (loop, runs) in ours.items()}
 
 
 def judged(config: Config, speed: str, name: str, loop: Loop) -> dict[str, Any]:
@@ -141,18 +145,18 @@ def of_speed(
     """Tune, compare, judge, prove. Returns the stages of the tuning, the loops, and the results of each."""
     stages = tuned(config.tuning, config.box, config.fixed, speed, report)
     those = compared(config, speed, robust, stages, lambda name: report(f"{speed}, found: {name}"))
-    loops = {name: one for name, (one, _) in those.items()}
+    loops = {name: loop for name, (loop, _) in those.items()}
     proved = proofs(config.proving, config.box, config.fixed, loops)
     report(f"{speed}, proofs")
     results, score, both = {}, scored(config, speed), scored(config, speed, TWO_SIDED)
-    for name, (one, runs) in those.items():
-        found = {
-            "objective": score(one),
-            "objective, both sides": both(one),
+    for name, (contender, runs) in those.items():
+        search = {
+            "objective": score(contender),
+            "objective, both sides": both(contender),
             "proof": proved[name],
             "runs to find": runs,
         }
-        results[name] = {**judged(config, speed, name, one), **found}
+        results[name] = {**judged(config, speed, name, contender), **search}
         report(f"{speed}, judged: {name}")
     return stages, loops, results
 
@@ -168,7 +172,7 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
         stages[speed], loops, rows = of_speed(config, speed, robust, told)
         printed(speed, rows)
         maps = degradation(loops[TUNED], speed, config.judging, config.map_points)
-        shown = {name: one for name, one in loops.items() if name in DRAWN}
+        shown = {name: loop for name, loop in loops.items() if name in DRAWN}
         figures[f"maps-{speed}"] = map_figure(maps, speed, config.box)
         figures[f"overshoot-{speed}"] = distributions(
             shown, speed, config.box, config.fixed, config.judging, config.drawn
@@ -177,8 +181,8 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
         told(f"{speed}, figures")
         results[speed] = {"controllers": rows, "beyond the box": maps, "tuning": described(stages[speed])}
         (folder / "controllers").mkdir(parents=True, exist_ok=True)
-        for name, one in loops.items():
-            record.write_summary(folder / "controllers", document(one), name=f"{speed}-{file_name(name)}.json")
+        for name, contender in loops.items():
+            record.write_summary(folder / "controllers", document(contender), name=f"{speed}-{file_name(name)}.json")
     figures["tuning"] = descents(stages)
     told(f"{time.perf_counter() - begun:.0f} s")
     return record.experiment(config, results | {"seconds": time.perf_counter() - begun}, figures)
@@ -193,12 +197,12 @@ def described(stages: dict[str, Tuned]) -> dict[str, Any]:
     """Return the results of the descents."""
     return {
         name: {
-            "objective": list(found.objective),
-            "values": {path: np.asarray(value).tolist() for path, value in found.values.items()},
-            "starts": [{"objective": one.objective, "reason": one.reason.value} for one in found.starts],
-            "gradients": sum(one.history[-1].evaluations for one in found.starts),
+            "objective": list(tuning.objective),
+            "values": {path: np.asarray(value).tolist() for path, value in tuning.values.items()},
+            "starts": [{"objective": descent.objective, "reason": descent.reason.value} for descent in tuning.starts],
+            "gradients": sum(descent.history[-1].evaluations for descent in tuning.starts),
         }
-        for name, found in stages.items()
+        for name, tuning in stages.items()
     }
 
 

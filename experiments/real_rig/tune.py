@@ -85,10 +85,10 @@ def lanes(
 ) -> tuple[Batch, np.ndarray]:
     """Points of the box, spread evenly, with their noise; and the floor of the objective of each."""
     points = spread(box, speed, count, config.seed)
-    found = dataclasses.replace(batch(columns(points), config.seed), durations=longest(points, fixed))
+    over = dataclasses.replace(batch(columns(points), config.seed), durations=longest(points, fixed))
     two_sided = "deviation" in weights
     weight = weights["deviation" if two_sided else "overshoot"]
-    return found, weight * floor(points, speed, fixed, two_sided=two_sided)
+    return over, weight * floor(points, speed, fixed, two_sided=two_sided)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,12 +136,12 @@ def tuned(
     """
     risk, worst = CVaR(level=config.level), SmoothWorst(softness=config.softness)
     lanes, steps = config.lanes, config.iterations
-    given = (config, box, fixed, speed, progress)
+    task = (config, box, fixed, speed, progress)
     first = searched(
-        Stage("starts", risk, config.few, config.starts[speed], config.tried), start(config, fixed, speed), *given
+        Stage("starts", risk, config.few, config.starts[speed], config.tried), start(config, fixed, speed), *task
     )
-    cvar = searched(Stage("CVaR", risk, lanes, 1, steps), first.part, *given)
+    cvar = searched(Stage("CVaR", risk, lanes, 1, steps), first.part, *task)
     later = [Stage("smooth worst", worst, lanes, 1, steps)]
     if speed == KNOWN:
         later.append(Stage("both sides", risk, lanes, 1, steps, TWO_SIDED))
-    return {"starts": first, "CVaR": cvar} | {stage.name: searched(stage, cvar.part, *given) for stage in later}
+    return {"starts": first, "CVaR": cvar} | {stage.name: searched(stage, cvar.part, *task) for stage in later}

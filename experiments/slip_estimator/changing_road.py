@@ -57,15 +57,15 @@ def roads(config: Config) -> dict[str, Any]:
         "plant.road.edges": (edge * v**2 / (2 * GRAVITY * OWN.D))[:, None],
     }
     for i, (d, b) in enumerate(((1.0, 1.0), (height, 1 / place))):
-        own = {"B": OWN.B * b, "C": OWN.C, "D": OWN.D * d, "E": OWN.E}
-        values |= {f"plant.road.roads.{i}.{name}": np.broadcast_to(x, len(edge)).copy() for name, x in own.items()}
+        formula = {"B": OWN.B * b, "C": OWN.C, "D": OWN.D * d, "E": OWN.E}
+        values |= {f"plant.road.roads.{i}.{name}": np.broadcast_to(x, len(edge)).copy() for name, x in formula.items()}
     return values | {"height": height, "place": place}
 
 
 def excess(config: Config, reference: Any, values: dict[str, Any]) -> np.ndarray:
     """Return the distance of each stop over its bound, less one; NaN for a car that does not stop."""
     road = Patches(roads=(OWN, OWN), edges=np.array([10.0]), width=config.width)
-    one = braking(
+    loop = braking(
         plant=QuarterCar(inertia=INERTIA, mass=config.mass, road=road),
         reference=reference,
         controller=PID(kp=3893.0, ki=config.ki, low=0.0, high=config.torque),
@@ -73,9 +73,9 @@ def excess(config: Config, reference: Any, values: dict[str, Any]) -> np.ndarray
     )
     lanes = {path: value for path, value in values.items() if "." in path}
     solver = FixedStep(step=config.step, duration=config.longest)
-    found = jax.device_get(run_batch(one, Batch(lanes), solver, {"distance": BRAKING["stop_distance"]}))
+    runs = jax.device_get(run_batch(loop, Batch(lanes), solver, {"distance": BRAKING["stop_distance"]}))
     shortest = bound(lanes, config.torque, config.width).distance
-    return np.where(found.stopped & ~found.diverged, found.metrics["distance"] / shortest - 1, np.nan)
+    return np.where(runs.stopped & ~runs.diverged, runs.metrics["distance"] / shortest - 1, np.nan)
 
 
 def line(name: str, values: dict[str, Any], above: np.ndarray) -> dict[str, Any]:
@@ -96,12 +96,12 @@ def main(config: Config | None = None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config = config or Config()
     values = roads(config)
-    found = {name: excess(config, reference, values) for name, reference in RULES.items()}
-    rows = [line(name, values, above) for name, above in found.items()]
+    excesses = {name: excess(config, reference, values) for name, reference in RULES.items()}
+    rows = [line(name, values, above) for name, above in excesses.items()]
     record.print_rows("Distance above the bound, on a road that changes to a slippery one", rows)
     places: list[dict[str, Any]] = [
         {"place of the peak": p}
-        | {name: 100 * float(np.nanmean(above[values["place"] == p])) for name, above in found.items()}
+        | {name: 100 * float(np.nanmean(above[values["place"] == p])) for name, above in excesses.items()}
         for p in config.places
     ]
     record.print_rows("By the slip of the second peak, relative to the first: mean above the bound [%]", places)

@@ -72,17 +72,17 @@ def noisy(config: Config, loops: list[Loop], duration: float) -> tuple[Any, Any]
     distance so far."""
     keys = jax.random.split(jax.random.key(config.seed), config.seeds)
     solver = FixedStep(step=config.step, duration=duration)
-    one = jax.vmap(lambda loop, key: measure(loop, solver, OBJECTIVES, key=key), (None, 0))
+    runs = jax.vmap(lambda loop, key: measure(loop, solver, OBJECTIVES, key=key), (None, 0))
     first, lanes = stack_loops(loops)
-    run = lanes.each(first, lambda loop, key: one(loop, keys))
+    run = lanes.each(first, lambda loop, key: runs(loop, keys))
     stopped = np.asarray(run.stopped)
     return np.where(stopped, run.metrics["distance"], run.ending.sample.output.distance), stopped
 
 
 def statistics(distance: Any, stopped: Any) -> dict[str, Any]:
     """Return the statistics of one loop over the seeds."""
-    mean, deviation, most = (float(f(distance)) for f in (np.mean, lambda x: np.std(x, ddof=1), np.max))
-    return {"mean [m]": mean, "deviation [m]": deviation, "worst [m]": most, "stopped": int(stopped.sum())}
+    mean, deviation, worst = (float(f(distance)) for f in (np.mean, lambda x: np.std(x, ddof=1), np.max))
+    return {"mean [m]": mean, "deviation [m]": deviation, "worst [m]": worst, "stopped": int(stopped.sum())}
 
 
 def bare(config: Config) -> list[dict[str, Any]]:
@@ -115,14 +115,14 @@ def robust(config: Config) -> list[dict[str, Any]]:
 
 def best(config: Config, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """For each setting, its worst run over all noises, seeds and cars; the best setting first."""
-    found = []
+    settings = []
     for t in config.time_constants:
         for th in config.thresholds:
-            mine = [r for r in rows if (r["time constant [s]"], r["threshold [1]"]) == (t, th) and r["arming [m/s2]"]]
-            mean = float(np.mean([r["mean [m]"] for r in mine]))
-            worst = max(r["worst [m]"] for r in mine)
-            found.append({"time constant [s]": t, "threshold [1]": th, "mean [m]": mean, "worst [m]": worst})
-    return sorted(found, key=lambda r: r["worst [m]"])
+            group = [r for r in rows if (r["time constant [s]"], r["threshold [1]"]) == (t, th) and r["arming [m/s2]"]]
+            mean = float(np.mean([r["mean [m]"] for r in group]))
+            worst = max(r["worst [m]"] for r in group)
+            settings.append({"time constant [s]": t, "threshold [1]": th, "mean [m]": mean, "worst [m]": worst})
+    return sorted(settings, key=lambda r: r["worst [m]"])
 
 
 def biased(config: Config) -> list[dict[str, Any]]:
@@ -150,8 +150,8 @@ def biased(config: Config) -> list[dict[str, Any]]:
 def figures(config: Config, rows: list[dict[str, Any]], latch: list[dict[str, Any]]) -> dict[str, Any]:
     """Mean and worst distance over noise: bare latch, and the robust one at each time constant."""
     figure, axes = plot.sheet(1, 2, title="Accelerometer noise, P control, spline B", size=(5.6, 3.8))
-    mine = [r for r in latch if r["car"] == "spline B" and r["controller"] == "P"]
-    axes[0].plot(config.noises, [r["mean [m]"] for r in mine], "o-", color=plot.COLOURS[6], label="bare latch")
+    group = [r for r in latch if r["car"] == "spline B" and r["controller"] == "P"]
+    axes[0].plot(config.noises, [r["mean [m]"] for r in group], "o-", color=plot.COLOURS[6], label="bare latch")
     for ax, kind in zip(axes, ("mean [m]", "worst [m]"), strict=True):
         for i, t in enumerate(config.time_constants):
             y = [
@@ -181,9 +181,9 @@ def main(config: Config | None = None) -> dict[str, Any]:
     record.print_rows("The robust estimator: best settings over all noises, seeds and cars", ranked[:6])
     unarmed = [r for r in rows if not r["arming [m/s2]"]]
     record.print_rows("The robust estimator, not armed", unarmed)
-    chosen = (ranked[0]["time constant [s]"], ranked[0]["threshold [1]"])
-    mine = [r for r in rows if (r["time constant [s]"], r["threshold [1]"]) == chosen and r["arming [m/s2]"]]
-    record.print_rows("The best setting", mine)
+    setting = (ranked[0]["time constant [s]"], ranked[0]["threshold [1]"])
+    group = [r for r in rows if (r["time constant [s]"], r["threshold [1]"]) == setting and r["arming [m/s2]"]]
+    record.print_rows("The best setting", group)
     record.print_rows("Accelerometer bias [m/s2]: stopping distance [m], empty where it did not stop", bias)
     results = {"bare": latch, "robust": rows, "ranked": ranked, "bias": bias}
     return record.experiment(config, results, figures(config, rows, latch))

@@ -92,9 +92,9 @@ def against_reference(config: Config, rows: list[dict[str, Any]]) -> list[dict[s
     """Our 1 ms against the independent solution."""
     table = []
     for name, time, distance in config.reference:
-        found = next(r for r in rows if r["controller"] == name and r["period [ms]"] == 1.0 and r["delay [ms]"] == 0.0)
-        table.append(record.computed_row(f"{name}, 1 ms", "time", "s", found["time [s]"], reference=time))
-        table.append(record.computed_row(f"{name}, 1 ms", "distance", "m", found["distance [m]"], reference=distance))
+        row = next(r for r in rows if r["controller"] == name and r["period [ms]"] == 1.0 and r["delay [ms]"] == 0.0)
+        table.append(record.computed_row(f"{name}, 1 ms", "time", "s", row["time [s]"], reference=time))
+        table.append(record.computed_row(f"{name}, 1 ms", "distance", "m", row["distance [m]"], reference=distance))
     return table
 
 
@@ -123,18 +123,18 @@ def figures(config: Config, rows: list[dict[str, Any]], runs: dict[str, Run]) ->
     figure, axes = plot.sheet(1, 2, title="Sample-and-hold control costs distance through its delay", size=(5.4, 3.8))
     for ax, name in zip(axes, gains(config), strict=True):
         for i, delay in enumerate(config.delays):
-            chosen = [
+            delayed = [
                 r
                 for r in rows
                 if r["controller"] == name and np.isclose(r["delay [ms]"], delay * r["period [ms]"], atol=1e-9)
             ]
-            x, y = ([r[key] for r in chosen] for key in ("period [ms]", "distance [m]"))
+            x, y = ([r[key] for r in delayed] for key in ("period [ms]", "distance [m]"))
             ax.plot(x, y, "o" + plot.DASHES[i], color=plot.COLOURS[i], markersize=4, label=f"delay {delay:g} period")
         plot.label_axes(ax, "period [ms]", "stopping distance [m]", f"conventional {name}")
-    seen: dict[str, Any] = {name: run.trajectory for name, run in runs.items()}
+    trajectories: dict[str, Any] = {name: run.trajectory for name, run in runs.items()}
     return {
         "distance": figure,
-        "speeds": plot.draw_speeds(seen, title="P control, sampled, one period of computing delay"),
+        "speeds": plot.draw_speeds(trajectories, title="P control, sampled, one period of computing delay"),
     }
 
 

@@ -97,15 +97,17 @@ def bounds(config: Config, machine: Machine) -> Any:
     It is the lesser of two: with a limit of the voltage only, and with one of the current only.
     """
 
-    def one(rider: Any) -> Any:
+    def largest(rider: Any) -> Any:
         plant = dataclasses.replace(machine.plant(), rider_mass=rider)
         a, b = BalanceModel(plant=plant).matrices()
         by_voltage = recoverable_bound(a, b, START, config.voltage)
-        most = machine.current * machine.resistance  # the voltage that drives this current through a motor without emf
+        voltage = (
+            machine.current * machine.resistance
+        )  # the voltage that drives this current through a motor without emf
         a, b = BalanceModel(plant=dataclasses.replace(plant, back_emf=0.0 * plant.back_emf)).matrices()
-        return jnp.minimum(by_voltage, recoverable_bound(a, b, START, most))
+        return jnp.minimum(by_voltage, recoverable_bound(a, b, START, voltage))
 
-    return jax.vmap(one)(jnp.asarray(config.riders))
+    return jax.vmap(largest)(jnp.asarray(config.riders))
 
 
 def limits(config: Config, shape: str) -> dict[str, tuple[float, float]]:
@@ -127,15 +129,15 @@ def best_bound(config: Config, machine: Machine, shape: str) -> Machine:
 
     start = np.clip(np.log([float(getattr(machine, name)) for name in FREE]), low, high)
     ranges = np.stack([low, high], axis=1)
-    found = minimize(
+    optimum = minimize(
         lambda z: [np.asarray(x, float) for x in loss(z)], start, jac=True, method="L-BFGS-B", bounds=ranges
     )
-    return replace(machine, {name: float(x) for name, x in zip(FREE, np.exp(found.x), strict=True)})
+    return replace(machine, {name: float(x) for name, x in zip(FREE, np.exp(optimum.x), strict=True)})
 
 
-def counted(config: Config, loop: Loop, riders: Any, most: float) -> list[Reach]:
-    """Return for each rider the largest recovered multiple, of so many up to `most`, by runs."""
-    multiples = np.linspace(0.0, most, config.judged_multiples + 1)[1:]
+def counted(config: Config, loop: Loop, riders: Any, top: float) -> list[Reach]:
+    """Return for each rider the largest recovered multiple, of so many up to `top`, by runs."""
+    multiples = np.linspace(0.0, top, config.judged_multiples + 1)[1:]
     solver = FixedStep(step=config.judged_step, duration=config.judged_duration)
     return largest_recovered_multiples(loop, {"plant.rider_mass": np.asarray(riders)}, DIRECTION, multiples, solver)
 
@@ -151,11 +153,11 @@ def tuned(config: Config, machine: Machine, shape: str) -> Machine:
     inside = {
         name: np.clip(float(getattr(machine, name)), 1.01 * low, 0.99 * high) for name, (low, high) in ranges.items()
     }
-    best, most = replace(machine, inside), float(jnp.max(bounds(config, machine)))
-    worst = worst_of(counted(config, best.closed_loop(), config.riders, most))
+    best, bound = replace(machine, inside), float(jnp.max(bounds(config, machine)))
+    worst = worst_of(counted(config, best.closed_loop(), config.riders, bound))
     machine = best
     for _ in range(config.stages):
-        top = config.beyond * max(worst, 0.05 * most)
+        top = config.beyond * max(worst, 0.05 * bound)
         multiples = np.linspace(0.1, 1.0, config.multiples) * top
         riders, multiples = (x.ravel() for x in np.meshgrid(config.riders, multiples, indexing="ij"))
         over = {"plant.rider_mass": riders, "initial.theta": START[0] * multiples, "initial.phi": START[2] * multiples}
@@ -172,7 +174,7 @@ def tuned(config: Config, machine: Machine, shape: str) -> Machine:
             ),
             method=Method(stopping=Stopping(iterations=config.iterations)),
         ).part
-        now = worst_of(counted(config, machine.closed_loop(), config.riders, most))
+        now = worst_of(counted(config, machine.closed_loop(), config.riders, bound))
         if now > worst:
             best, worst = machine, now
     return best
@@ -181,12 +183,12 @@ def tuned(config: Config, machine: Machine, shape: str) -> Machine:
 def for_one(config: Config, machine: Machine, shape: str, rider: float = 50.0) -> Machine:
     """The machine and weights that recover the most with one rider, of designs drawn around this one."""
     ranges = limits(config, shape) | {"rider": config.designed_for, **WEIGHTS}
-    most = float(jnp.max(bounds(config, machine)))
-    least = worst_of(counted(config, machine.closed_loop(), [rider], most))
+    bound = float(jnp.max(bounds(config, machine)))
+    multiple = worst_of(counted(config, machine.closed_loop(), [rider], bound))
     solver = FixedStep(step=config.judged_step, duration=config.judged_duration)
     judge = random_designs.runs(lambda z: replace(machine, z).closed_loop(), rider, START, solver)
     centre = {name: np.asarray(getattr(machine, name)) for name in ranges}
-    return replace(machine, random_designs.improved(config.draws, centre, ranges, judge, least)[0])
+    return replace(machine, random_designs.improved(config.draws, centre, ranges, judge, multiple)[0])
 
 
 def motor_power(voltage: float, resistance: float, current: float) -> float:
@@ -224,24 +226,24 @@ def judged(config: Config, machine: Machine) -> dict[str, Any]:
     loop = machine.closed_loop()
     riders = np.array([*config.riders, 50.0])
     reaches = counted(config, loop, riders, float(jnp.max(bounds(config, machine))))
-    found = np.array([reach.multiple for reach in reaches])
+    multiples = np.array([reach.multiple for reach in reaches])
     box = {"plant.rider_mass": (min(config.riders), max(config.riders))}
     for name in ("stiffness", "damping"):
         value = float(getattr(loop.plant, name))
         box[f"plant.{name}"] = (0.7 * value, 1.3 * value)
     gain = np.asarray(loop.controller.gain)
     proof = certify(gain, grid_polytope(BalanceModel(plant=loop.plant), box, 3))
-    start = {"initial.theta": START[0] * found.min(), "initial.phi": START[2] * found.min()}
+    start = {"initial.theta": START[0] * multiples.min(), "initial.phi": START[2] * multiples.min()}
     solver = FixedStep(step=config.judged_step, duration=config.judged_duration)
     heavy = replace(loop, {**start, "plant.rider_mass": riders.max()})
     run = jax.tree.map(float, rollout(heavy, solver, BALANCE).metrics)
     span = float(machine.reach * (machine.mount - CLEAR))
     return {
-        "recovered by rider": dict(zip(riders.tolist(), found.tolist(), strict=True)),
+        "recovered by rider": dict(zip(riders.tolist(), multiples.tolist(), strict=True)),
         "undecided beyond, riders": [float(m) for m, reach in zip(riders, reaches, strict=True) if reach.undecided],
-        "worst": float(found[:-1].min()),
-        "50 kg": float(found[-1]),
-        "times the hanging arm, 50 kg": float(found[-1]) / HANGING,
+        "worst": float(multiples[:-1].min()),
+        "50 kg": float(multiples[-1]),
+        "times the hanging arm, 50 kg": float(multiples[-1]) / HANGING,
         "common P over the riders": {True: "yes", False: "none", None: "undecided"}[proof.quadratically_stable],
         "gain": gain.tolist(),
         "plant": {field.name: float(getattr(loop.plant, field.name)) for field in dataclasses.fields(loop.plant)},
@@ -250,15 +252,15 @@ def judged(config: Config, machine: Machine) -> dict[str, Any]:
     }
 
 
-def figure(found: dict[str, dict[str, Any]]) -> Any:
+def figure(results: dict[str, dict[str, Any]]) -> Any:
     """Recovered multiples over riders."""
     drawn, (ax,) = plot.sheet(title="Recovered at 48 V, one gain for every rider", size=(6.8, 4.0))
-    for i, (name, row) in enumerate(found.items()):
+    for i, (name, row) in enumerate(results.items()):
         riders, multiples = zip(*sorted(row["recovered by rider"].items()), strict=True)
         ax.plot(riders, multiples, "o" + plot.DASHES[i], color=plot.COLOURS[i], label=name)
     ax.plot([50.0], [HANGING], "k*", markersize=11, label="the paper's machine with its arm hanging, LQR")
     plot.label_axes(ax, "rider [kg]", "multiple of (0.5, 0, 0.2) rad")
-    ax.set_ylim(0, 1.6 * max(max(row["recovered by rider"].values()) for row in found.values()))
+    ax.set_ylim(0, 1.6 * max(max(row["recovered by rider"].values()) for row in results.values()))
     return drawn
 
 
@@ -266,7 +268,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config = config or Config()
     hanging = load("arm-hanging").loop
-    rows, found = [], {}
+    rows, results = [], {}
     for i, (resistance, current) in enumerate(config.windings):
         for shape in ("rod", "flywheel"):
             machine = best_bound(config, Machine(loop=hanging, resistance=resistance, current=current), shape)
@@ -278,14 +280,15 @@ def main(config: Config | None = None) -> dict[str, Any]:
                 machine = tuned(config, machine, shape)
                 rows.append({"shape": shape, "by": "rollouts", **described(config, machine)})
                 name = f"{shape}, {resistance:g} ohm, {current:g} A"
-                found[name] = judged(config, machine)
+                results[name] = judged(config, machine)
                 if (i, shape) == config.alone:
                     machine = for_one(config, machine, shape)
                     rows.append({"shape": shape, "by": "draws", **described(config, machine)})
-                    found[f"{name}, for 50 kg"] = judged(config, machine)
+                    results[f"{name}, for 50 kg"] = judged(config, machine)
     record.print_rows("Machines", rows)
-    seen = ("worst", "50 kg", "undecided beyond, riders", "times the hanging arm, 50 kg", "common P over the riders")
+    keys = ("worst", "50 kg", "undecided beyond, riders", "times the hanging arm, 50 kg", "common P over the riders")
     record.print_rows(
-        "Tuned by rollouts", [{"machine": name, **{key: one[key] for key in seen}} for name, one in found.items()]
+        "Tuned by rollouts",
+        [{"machine": name, **{key: result[key] for key in keys}} for name, result in results.items()],
     )
-    return record.experiment(config, {"machines": rows, "tuned": found}, {"codesign": figure(found)})
+    return record.experiment(config, {"machines": rows, "tuned": results}, {"codesign": figure(results)})

@@ -51,7 +51,7 @@ class Config:
 def observed(config: Config, noise: tuple[float, float]) -> Loop:
     """The hanging arm under LQG."""
     loop = load("arm-hanging").loop
-    known = tuple(max(x, config.least_noise) for x in noise)
+    deviations = tuple(max(x, config.least_noise) for x in noise)
     limit = float(loop.actuator.high)
     controller = lqg(
         loop.plant,
@@ -59,7 +59,7 @@ def observed(config: Config, noise: tuple[float, float]) -> Loop:
         EFFORT,
         period=config.period,
         disturbance=config.disturbance,
-        noise=known,
+        noise=deviations,
         predicted_high=limit,
     )
     sensor = AngleSensor(theta=noise[0], psi=noise[1], period=config.period)
@@ -76,14 +76,14 @@ def share(config: Config, loop: Loop) -> tuple[np.ndarray, np.ndarray, np.ndarra
     )
     solver = FixedStep(step=config.step, duration=config.duration)
     runs = jax.device_get(run_batch(loop, Batch(starts, keys), solver, {"frame": FRAME}, engine=config.engine))
-    fine = ~runs.stopped & (runs.metrics["frame"] < config.band / (1 + config.band))
-    undecided = ~runs.stopped & ~runs.diverged & ~fine
-    return multiples, *(x.reshape(len(multiples), config.seeds).mean(axis=1) for x in (fine, undecided))
+    recovered = ~runs.stopped & (runs.metrics["frame"] < config.band / (1 + config.band))
+    undecided = ~runs.stopped & ~runs.diverged & ~recovered
+    return multiples, *(x.reshape(len(multiples), config.seeds).mean(axis=1) for x in (recovered, undecided))
 
 
-def largest(multiples: np.ndarray, shares: np.ndarray, least: float = 1.0) -> float:
+def largest(multiples: np.ndarray, shares: np.ndarray, level: float = 1.0) -> float:
     """Return the greatest multiple up to which this share of the seeds recovers; 0 where the first one does not."""
-    enough = shares >= least
+    enough = shares >= level
     good = len(shares) if enough.all() else int(np.argmin(enough))
     return float(multiples[good - 1]) if good else 0.0
 
@@ -91,26 +91,26 @@ def largest(multiples: np.ndarray, shares: np.ndarray, least: float = 1.0) -> fl
 def main(config: Config | None = None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config = config or Config()
-    found = {"full state, no noise": share(config, load("arm-hanging").loop)}
+    shares_by_loop = {"full state, no noise": share(config, load("arm-hanging").loop)}
     for noise in config.noises:
-        found[f"LQG, {1e3 * noise[0]:g} mrad"] = share(config, observed(config, noise))
-    full = largest(*found["full state, no noise"][:2])
+        shares_by_loop[f"LQG, {1e3 * noise[0]:g} mrad"] = share(config, observed(config, noise))
+    full = largest(*shares_by_loop["full state, no noise"][:2])
     rows = [
         {
             "controller": name,
-            "multiple": (c := largest(*one[:2])),
+            "multiple": (c := largest(*loop_shares[:2])),
             "of the full state's": c / full,
-            "95 % of the seeds": largest(*one[:2], 0.95),
-            "half of the seeds": largest(*one[:2], 0.5),
+            "95 % of the seeds": largest(*loop_shares[:2], 0.95),
+            "half of the seeds": largest(*loop_shares[:2], 0.5),
             "seeds": config.seeds,
-            "undecided runs": float(one[2].mean()),
+            "undecided runs": float(loop_shares[2].mean()),
         }
-        for name, one in found.items()
+        for name, loop_shares in shares_by_loop.items()
     ]
     record.print_rows("Recovered by every seed, hanging arm at 48 V", rows)
     drawn, (ax,) = plot.sheet(title="Hanging arm at 48 V, angles measured at 100 Hz", size=(6.6, 3.8))
-    for i, (name, (multiples, shares, _)) in enumerate(found.items()):
+    for i, (name, (multiples, shares, _)) in enumerate(shares_by_loop.items()):
         ax.plot(multiples, shares, plot.DASHES[i], color=plot.COLOURS[i], label=name)
     plot.label_axes(ax, "multiple of (0.5, 0, 0.2) rad", "share of seeds recovered")
-    shares = {name: one[1].tolist() for name, one in found.items()}
+    shares = {name: loop_shares[1].tolist() for name, loop_shares in shares_by_loop.items()}
     return record.experiment(config, {"table": rows, "shares": shares}, {"lqg": drawn})

@@ -35,28 +35,28 @@ def improved(
     centre: dict[str, Any],
     ranges: dict[str, tuple[float, float]],
     judge: Callable[[Values, np.ndarray], np.ndarray],
-    least: float,
+    multiple: float,
 ) -> tuple[dict[str, Any], float]:
-    """The best design found and its multiple, from a design that recovers `least`.
+    """The best design found and its multiple, from a design that recovers `multiple`.
 
     judge: designs and multiples -> whether each is recovered (designs, multiples)
     """
-    rng, best = np.random.default_rng(draws.seed), least
+    rng, best = np.random.default_rng(draws.seed), multiple
     for turn in range(draws.rounds):
         spread = draws.spread / (1 + turn)
         drawn = {name: _around(rng, draws.designs, spread, centre[name], *ends) for name, ends in ranges.items()}
         multiples = best * np.linspace(1.0, draws.reach, draws.multiples)
-        fine = np.cumprod(judge(drawn, multiples), axis=1).sum(axis=1)
-        first = int(np.argmax(fine))
-        if fine[first] > 1:
-            best, centre = float(multiples[fine[first] - 1]), {name: column[first] for name, column in drawn.items()}
+        counts = np.cumprod(judge(drawn, multiples), axis=1).sum(axis=1)
+        first = int(np.argmax(counts))
+        if counts[first] > 1:
+            best, centre = float(multiples[counts[first] - 1]), {name: column[first] for name, column in drawn.items()}
     return centre, best
 
 
 def _around(rng: np.random.Generator, count: int, spread: float, at: Any, low: float, high: float) -> np.ndarray:
-    there, back = (np.log, np.exp) if low > 0 else (np.asarray, np.asarray)
-    a, b = there(low), there(high)
-    place = (there(np.asarray(at, float)) - a) / (b - a)
+    forward, back = (np.log, np.exp) if low > 0 else (np.asarray, np.asarray)
+    a, b = forward(low), forward(high)
+    place = (forward(np.asarray(at, float)) - a) / (b - a)
     place = np.clip(place + spread * rng.standard_normal((count, *np.shape(place))), 0.0, 1.0)
     return back(a + (b - a) * place)
 
@@ -75,7 +75,7 @@ def runs(
         lanes = {path: np.repeat(np.asarray(column), len(multiples), axis=0) for path, column in columns.items()}
         each = np.tile(multiples, len(columns["plant.rider_mass"]))
         lanes |= {"initial.theta": start[0] * each, "initial.phi": start[2] * each}
-        one = jax.tree.map(lambda x: x[0], loops)
-        return classify_starts(one, lanes, solver).recovered.reshape(-1, len(multiples))
+        template = jax.tree.map(lambda x: x[0], loops)
+        return classify_starts(template, lanes, solver).recovered.reshape(-1, len(multiples))
 
     return judge

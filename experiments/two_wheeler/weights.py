@@ -52,7 +52,7 @@ class Config:
     effort_range: tuple[float, float] = (-12.0, 2.0)  # logarithm of R
     iterations: int = 40
     riders: tuple[float, float] = (40.0, 100.0)  # kg
-    off: float = 0.3  # of the rider's spring and damper
+    deviation: float = 0.3  # of the rider's spring and damper
     proof_points: int = 5  # of each parameter of the certificate's grid
     out: str = "out/experiments/two_wheeler/weights"
 
@@ -96,7 +96,7 @@ def judged(config: Config, gain: Any) -> tuple[Basin, dict[str, Any]]:
     solver = FixedStep(step=config.step, duration=config.duration)
     cells = Cells(-config.box, config.box, config.starts)
     basin = region_of_attraction(loop, cells, cells, solver)
-    low, high = 1 - config.off, 1 + config.off
+    low, high = 1 - config.deviation, 1 + config.deviation
     spring, damper = loop.plant.stiffness, loop.plant.damping
     over = {
         "plant.rider_mass": config.riders,
@@ -137,14 +137,14 @@ def figure(maps: dict[str, Basin], axes_of_bound: tuple[float, float]) -> Any:
 def main(config: Config | None = None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config = config or Config()
-    found = tuned(config)
-    unit = [lq_weights(found.part.loop, np.ones(6), r, found.part.design).closed_loop() for r in (1.0, config.effort)]
-    known = load("arm-hanging").loop.controller.gain
+    tuning = tuned(config)
+    unit = [lq_weights(tuning.part.loop, np.ones(6), r, tuning.part.design).closed_loop() for r in (1.0, config.effort)]
+    published = load("arm-hanging").loop.controller.gain
     gains = {
         "Q = I, R = 1": unit[0].controller.gain,
         f"Q = I, R = {config.effort:g}": unit[1].controller.gain,
-        "Q = diag(1, 100, 1, 1, 1, 1)": known,
-        "tuned": found.loop.controller.gain,
+        "Q = diag(1, 100, 1, 1, 1, 1)": published,
+        "tuned": tuning.loop.controller.gain,
     }
     gains = {name: np.asarray(gain) for name, gain in gains.items()}
     maps, rows = {}, []
@@ -153,14 +153,17 @@ def main(config: Config | None = None) -> dict[str, Any]:
         rows.append({"weights": name, **row})
     share, lines = possible(config)
     record.print_rows("Hanging arm at 48 V", rows)
-    weights = {"q": np.exp(2 * np.asarray(found.part.log_diagonal)).tolist(), "R": float(np.exp(found.part.log_effort))}
+    weights = {
+        "q": np.exp(2 * np.asarray(tuning.part.log_diagonal)).tolist(),
+        "R": float(np.exp(tuning.part.log_effort)),
+    }
     results = {
         "table": rows,
         "gains": {name: gain.tolist() for name, gain in gains.items()},
         "weights": weights,
         "possible share, linear model": share,
-        "soft loss": list(found.objective),
-        "gradients": found.evaluations,
-        "ended": found.reason.value,
+        "soft loss": list(tuning.objective),
+        "gradients": tuning.evaluations,
+        "ended": tuning.reason.value,
     }
     return record.experiment(config, results, {"attraction": figure(maps, lines)})

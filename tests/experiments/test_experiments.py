@@ -166,7 +166,7 @@ def test_tuned_over_roads_no_wheel_locks_longer(tmp_path):
         held_out=8,
         candidates=64,
         near=0.1,
-        kept=4,
+        nearest=4,
         few=4,
         iterations=2,
         own_step=1e-3,
