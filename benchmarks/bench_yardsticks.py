@@ -35,7 +35,7 @@ from scipy.integrate import solve_ivp
 
 import diffabs as d
 from diffabs.compiler.runtime import toolchain
-from diffabs.engine.solve import SolutionStatus
+from diffabs.engine.field import SolutionStatus
 
 STEPS, ACCURACY, CHECKED, BLOCK = 1000, 1e-8, 256, 512
 LADDER = [10.0**-k for k in np.arange(6.0, 12.1, 0.5)]

@@ -8,7 +8,7 @@ _interrupt.end_early_on_interrupt()  # before JAX, whose import takes seconds
 
 from diffabs.core.pytree import arrays as arrays
 from diffabs.core.pytree import replace as replace
-from diffabs.engine.solve import Event as Event
+from diffabs.engine.field import Event as Event
 from diffabs.engine.solve import Solution as Solution
 from diffabs.engine.solve import solve as solve
 from diffabs.engine.solve import switches as switches

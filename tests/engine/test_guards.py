@@ -11,7 +11,7 @@ from project import ROOT
 from scipy.optimize import brentq
 
 import diffabs as d
-from diffabs.engine.solve import SolutionStatus
+from diffabs.engine.field import SolutionStatus
 
 SOLVER, END, INFLOW = d.Adaptive(1e-8), 4.0, 0.3
 RATES = jnp.array([0.4, 1.0, 1.3])  # the tank is empty after 2/rate

@@ -8,7 +8,7 @@ from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, objectives
-from diffabs.engine.solve import SolutionStatus
+from diffabs.engine.field import SolutionStatus
 from diffabs.engine.step.status import RunStatus
 from diffabs.loop.arguments import prepare_arguments
 from diffabs.loop.result import finish_run
@@ -38,7 +38,7 @@ def saved(start, end, save):
     return found.y, found.status
 
 
-@killed_by("engine.solve", "jnp.where(save == t0, 1.0, jnp.nan)", "jnp.nan")
+@killed_by("engine.admission", "jnp.where(save == t0, 1.0, jnp.nan)", "jnp.nan")
 def test_an_empty_span_has_its_start_at_its_saves():
     values, status = jax.jit(jax.vmap(saved, (None, 0, None)))(0.2, ENDS, jnp.array([0.2, 0.7]))
     np.testing.assert_allclose(values, [[1.0, np.nan], [1.0, np.exp(-0.5)], [1.0, np.exp(-0.5)]], atol=1e-7)

@@ -7,7 +7,7 @@ import pytest
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.engine.solve import SolutionStatus
+from diffabs.engine.field import SolutionStatus
 
 CROWDED, FINISHED, TERMINATED = SolutionStatus.CROWDED, SolutionStatus.FINISHED, SolutionStatus.TERMINATED
 METHODS = pytest.mark.parametrize(
@@ -40,7 +40,7 @@ LEVEL = d.Event(lambda t, y, above: y[0] - 0.5, lambda t, y, above: y.at[0].set(
 @METHODS
 @pytest.mark.parametrize("start", [1.0, 0.5], ids=["later", "at t0"])
 @killed_by(
-    "engine.solve", "unmoved & ~(rise > 0), -small - after", "~(rise > 0), -small - after", case="later-adaptive"
+    "engine.field", "unmoved & ~(rise > 0), -small - after", "~(rise > 0), -small - after", case="later-adaptive"
 )
 @killed_by("engine.solve", "| (status == SolutionStatus.SLID)) & (held", ") & (held", case="later-fixed")
 def test_a_condition_that_its_reset_sets_near_zero_falls_again(solver, engine, start):
@@ -53,7 +53,7 @@ def test_a_condition_that_its_reset_sets_near_zero_falls_again(solver, engine, s
 @pytest.mark.slow
 @METHODS
 @killed_by(
-    "engine.solve", "zero & (happens | ~unmoved), new, old_lift", "zero & happens, new, old_lift", case="adaptive"
+    "engine.field", "zero & (happens | ~unmoved), new, old_lift", "zero & happens, new, old_lift", case="adaptive"
 )
 def test_a_condition_that_another_reset_sets_near_zero_falls(solver, engine):
     """A timer sets the state to 2 at 0.3. There the second event sets it to 5, of which 2.7 are left at 3; or it ends

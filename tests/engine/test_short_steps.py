@@ -14,7 +14,7 @@ from shown_state import ShownState
 import diffabs as d
 from diffabs import controllers, objectives, references, stops
 from diffabs.core.pytree import param, pytree
-from diffabs.engine.solve import SolutionStatus
+from diffabs.engine.field import SolutionStatus
 
 ACCURACY = 1e-6  # for an rtol of 1e-8
 

@@ -12,7 +12,7 @@ import pytest
 from mutants import killed_by
 
 import diffabs as d
-from diffabs.engine.solve import SolutionStatus
+from diffabs.engine.field import SolutionStatus
 from diffabs.robust.reach import NoRule
 from diffabs.robust.reach.equations import derive_equations
 
