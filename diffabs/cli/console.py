@@ -264,6 +264,12 @@ def run_with_progress(
     return result[0]
 
 
+def run_with_lines(work: Callable[[Callable[[str], None]], T], message: str) -> T:
+    """Return the result of `work`, and show the last line of progress that it gives to its argument."""
+    lines = [""]
+    return run_with_progress(lambda: work(lines.append), message, lambda: lines[-1])
+
+
 @contextlib.contextmanager
 def warnings_in_lines() -> Iterator[None]:
     """Write each warning of Python code as one line, without file and line number."""

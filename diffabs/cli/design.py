@@ -1,21 +1,18 @@
-"""The commands `design`, `certify` and `verify`: a robust gain for a scenario, and proofs about a gain.
+"""The commands `design` and `certify`: a robust gain for a scenario, and proofs about a gain.
 
-`design` and `certify` need the extra `design`. Modules that need it are imported only when a command runs.
+They need the extra `design`. Modules that need it are imported only when a command runs.
 """
 
 import functools
-import math
 import pathlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from diffabs.cli import certificates, console, show, show_proofs, targets
+from diffabs.cli import certificates, console, show, targets
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
-from diffabs.host import documents, provenance
-from diffabs.host.process import core_count
 from diffabs.scenario import proving
 from diffabs.scenario.scenario import Scenario
 
@@ -88,56 +85,6 @@ def certify(
         _show(document(out, reason=reason or None, further=further), task, as_json)
         if reason:
             console.conclude(f"{setup.name}: {reason}")
-
-
-def verify_certificate(
-    file: Annotated[
-        pathlib.Path, typer.Argument(metavar="FILE.json", help="Certificate written by design, certify or prove.")
-    ],
-    seconds: Annotated[
-        float,
-        typer.Option(help="Of a file of design or certify: limit of the computing time [s]; then not proved."),
-    ] = 6.0,
-    share: Annotated[
-        float, typer.Option(help="Of a file of prove: share of its cells to check, drawn at random.")
-    ] = 0.01,
-    as_json: console.Json = False,
-) -> None:
-    """Prove a saved certificate again: of design and certify in exact fractions, of prove in Arb's balls.
-
-    The code is independent of the code that made the certificate.
-    Exit status: 0 proved, or not refuted where --share leaves cells unchecked; 1 not proved, 2 no certificate."""
-    from diffabs.scenario.proofs import verify
-
-    with console.end_on_errors():
-        if not 0 < seconds < math.inf:
-            console.fail(f"--seconds = {seconds:g} is outside (0, inf) s")
-        if not 0 < share <= 1:
-            console.fail(f"--share = {share:g} is outside (0, 1]")
-        far = [""]
-        try:
-            verification = console.run_with_progress(
-                lambda: verify(
-                    file, share=share, seconds=seconds, progress=lambda line: far.__setitem__(0, line),
-                    processes=core_count(),
-                ),
-                f"verifying {file}",
-                lambda: far[0],
-            )  # fmt: skip
-        except ModuleNotFoundError:
-            console.need_extra("proof")
-            raise
-        except ValueError as error:
-            console.fail(f"{file}: {' '.join(str(error).split())}")
-        versions = provenance.versions(*(["numpy"] if verification.scenario else []))
-        result = {"file": str(file), **verification.record(), "versions": versions}
-        show.show_verification(documents.stamp("verification", result), as_json)
-        if verification.reason:
-            console.conclude(f"{file}: not proved: {verification.reason}")
-        if verification.scenario and not as_json:
-            box_words = show_proofs.describe_box(verification.over, verification.scenario, digits=9)
-            where = "" if verification.complete else "in the cells proved again only: "
-            console.say(f"{where}for every {box_words} of the scenario in the file, whatever its title says")
 
 
 def _prepare(

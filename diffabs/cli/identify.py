@@ -5,30 +5,20 @@ It needs the extra `tune`. Modules that need it are imported only when the comma
 
 import functools
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from diffabs.cli import certificates, console, progress, show, targets
-from diffabs.cli.options import read_assignments
-from diffabs.core.pytree import ParameterSpec
+from diffabs.cli import certificates, console, identify_options, progress, show, targets
 from diffabs.core.types import JsonObject
-from diffabs.host.values import ScenarioError, format_given, read_number_in_range, unknown_name_error
-from diffabs.scenario import section_tune, toml
-from diffabs.scenario.measurements import Readings, read_measurements, read_separator
+from diffabs.scenario import section_tune
+from diffabs.scenario.measurements import Readings, read_separator
 from diffabs.scenario.model import result_document
-from diffabs.scenario.parameter_paths import flatten_table
 from diffabs.scenario.scenario import Scenario, dump
 
 if TYPE_CHECKING:
     from diffabs.tune.identify.fit import Identified
-
-DEPENDENT = {"slip", "speed", "wheel_speed"}
-REDUNDANT = (
-    "slip, speed and wheel_speed depend on each other; together they make the standard deviations too small; choose"
-    " columns with --column"
-)
 
 
 def identify(
@@ -75,10 +65,10 @@ def identify(
         with targets.new_target_file(out, "--out") as file:
             setup = console.load_scenario(scenario, changes)
             units = setup.loop.plant.shows.units
-            file_form = _read_renames(rename or ()), read_separator(separator, "--separator")
-            readings = _compared_columns(data, column, units, *file_form)
-            noise = _read_noise(sigma or (), readings, units)
-            ranges = _read_ranges(free, setup)
+            file_form = identify_options.read_renames(rename or ()), read_separator(separator, "--separator")
+            readings = identify_options.read_columns(data, column, units, *file_form)
+            noise = identify_options.read_noise(sigma or (), readings, units)
+            ranges = identify_options.read_ranges(free, setup)
             fit, noise, interrupted = _fit_with_progress(setup, readings, ranges, noise)
             result = {**_result(setup, readings, ranges, fit, noise), "interrupted": interrupted}
             show_result = functools.partial(show.show_result, as_json, show.show_identification, result)
@@ -95,68 +85,6 @@ def identify(
                     file.write_text(dump(setup.with_loop(fit.part, "identified")), encoding="utf-8")
         result["files"] |= {"out": str(out)} if out else {}
         show_result()
-
-
-def _read_renames(options: Sequence[str]) -> dict[str, str]:
-    """Return signals by the name of their column in the file."""
-    names = {}
-    for text in options:
-        column, equals, name = (word.strip() for word in text.rpartition("="))
-        if not (equals and column and name):
-            raise ScenarioError(f"--rename {format_given(text)} is not of the form column=name")
-        if column in names:
-            raise ScenarioError(f"--rename {format_given(column)} is given twice")
-        names[column] = name
-    return names
-
-
-def _compared_columns(
-    data: pathlib.Path,
-    names: Sequence[str] | None,
-    units: Mapping[str, str],
-    renamed: Mapping[str, str] | None = None,
-    separator: str | None = None,
-) -> Readings:
-    """Return the columns of a file that are compared. Who names some columns may have others in the file."""
-    strict = not (names or renamed)
-    readings = read_measurements(data, units, renamed=renamed, separator=separator, strict=strict)
-    if readings.unread:
-        console.say(f"note: not compared: {', '.join(readings.unread)}")
-    if readings.infinite and not names:
-        console.say(f"note: {', '.join(readings.infinite)} is infinite in every row of the data, and is not compared")
-    compared = readings.select(names or (), "--column")
-    if set(compared.columns) >= DEPENDENT:
-        console.say(f"note: {REDUNDANT}")
-    return compared
-
-
-def _read_noise(options: Sequence[str], readings: Readings, units: Mapping[str, str]) -> dict[str, float]:
-    """Return standard deviations by column, in SI."""
-    deviations: dict[str, float] = {}
-    for name, number, _ in read_assignments(options, "--sigma", "column=number"):
-        if name not in readings.columns:
-            raise unknown_name_error(
-                f"--sigma {format_given(name)} is not a column of the data", name, readings.columns
-            )
-        spec = ParameterSpec(units[name], low=0.0, open_low=True)
-        deviations[name] = read_number_in_range(toml.parse_value(number), spec, f"--sigma {name}")
-    return deviations
-
-
-def _read_ranges(options: Sequence[str], scenario: Scenario) -> dict[str, section_tune.Ends | None]:
-    """Return ranges by path; None for the declared range."""
-    table = {}
-    for path, ends, text in read_assignments(options, "--free"):
-        words = [word.strip() for word in ends.split(":", 1)]
-        if not path or ("=" in text and len(words) < 2):
-            raise ScenarioError(f"--free {format_given(text)} is not of the form path or path=low:high")
-        (path,) = flatten_table({path: 0.0}, "--free")
-        if path in table:
-            raise ScenarioError(f"--free {path} is given twice")
-        table[path] = [*map(toml.parse_value, words)] if "=" in text else section_tune.DECLARED_RANGE
-    ranges = section_tune.free_ranges(table, scenario.loop, "--free")
-    section_tune.check_starts(scenario.loop, ranges, "--free")
-    return ranges
 
 
 def _fit_with_progress(

@@ -33,6 +33,7 @@ from diffabs.cli import (
     sweep,
     tune,
     usage,
+    verify,
 )
 from diffabs.core import jax_flags
 from diffabs.host import compilation_cache, interrupt
@@ -87,7 +88,7 @@ def setup(
 usage.add_command(app, simulate.simulate, "simulate slip-lmi --set plant.mass=6.2 --plot run.png")
 usage.add_command(app, design.design, "design slip-lmi --set design.decay=80 --out gain.json")
 usage.add_command(app, design.certify, "certify slip-lmi --gain=-11753,-76.7")
-usage.add_command(app, design.verify_certificate, "verify gain.json", "verify")
+usage.add_command(app, verify.verify_certificate, "verify gain.json", "verify")
 usage.add_command(app, prove.prove, "prove slip-cured --over plant.mass=5.3:6.2 --claim overshoot=0.02")
 usage.add_command(app, explore.explore, "explore slip-cured --port 8342")
 usage.add_command(app, margins.margins, "margins slip-cured --at speed=5 --plot loop.png")

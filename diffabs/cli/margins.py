@@ -1,32 +1,22 @@
 """The command `margins`: stability margins of the linearised loop."""
 
-import math
 import pathlib
 from collections.abc import Sequence
 from functools import partial
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from diffabs.cli import console, show, tables, targets
+from diffabs.cli import console, show, show_margins, targets
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.types import JsonObject
 from diffabs.host import documents, provenance
 from diffabs.host.separated import read_decimal
 from diffabs.host.values import ScenarioError, format_given
-from diffabs.linear.robustness import System
 from diffabs.scenario.parameter_paths import parameters_of, read_fixed_values
-from diffabs.scenario.registry import KMH
 from diffabs.scenario.robustness import ScenarioMargins, examine_margins
 from diffabs.scenario.scenario import Scenario
 
-MARGIN_NAMES = {
-    **{"gain_up": "gain may rise to, times", "gain_down": "gain may fall to, times", "phase": "phase margin [deg]"},
-    **{"delay": "delay margin [ms]", "modulus": "modulus margin, 1/Ms", "sensitivity": "greatest |S|, Ms"},
-    **{"complementary": "greatest |T|, Mt", "crossover": "crossover [rad/s]"},
-}
-SHOWN_IN = {"phase": math.degrees(1), "delay": 1e3}
 MOST_SAMPLES = 10_000
 SHORT_PATHS = {"speed": "initial.speed", "speed_kmh": "initial.speed_kmh"}
 
@@ -69,7 +59,7 @@ def margins(
                 console.fail(f"{setup.name}: {error}", console.FAILED)
             result = {"scenario": setup.name, **margin_results.record(), "versions": provenance.versions(), "files": {}}
             result = documents.stamp("margins", result)
-            show_result = partial(show.show_result, as_json, _show, result, setup, margin_results)
+            show_result = partial(show.show_result, as_json, show_margins.show_margins, result, setup, margin_results)
             if picture:
                 with console.show_before_errors(show_result):
                     console.run_with_progress(lambda: _draw(setup, margin_results, picture), "drawing")
@@ -104,44 +94,11 @@ def _draw(scenario: Scenario, margins: ScenarioMargins, picture: pathlib.Path) -
     frequency.loop_shape(margins.nominal.loop, margins.nominal.margins, loops, title=title).savefig(picture)
 
 
-def _show(result: JsonObject, scenario: Scenario, margins: ScenarioMargins) -> None:
-    """Show a table of the margins, with the worst value and its place."""
-    worst = margins.band.worst()
-    table = Table("margin", "here", *([f"worst of {len(margins.band.systems)}", "where"] if worst else []))
-    for name, words in MARGIN_NAMES.items():
-        row = [_format_margin(name, margins.nominal)]
-        if system := worst.get(name):
-            row += [_format_margin(name, system), _format_place(system.values, scenario)]
-        table.add_row(words, *row)
-    when = f"sampled every {1e3 * result['period']:g} ms" if result["period"] else "in continuous time"
-    delay = f", {1e3 * result['delay_in_the_loop']:g} ms of delay" if result["delay_in_the_loop"] else ""
-    tables.show_titled_table(f"{scenario.title or scenario.name}: the linearised loop, {when}{delay}", table)
-    if frozen := getattr(scenario.loop.plant, "frozen", ()):
-        console.say(f"note: {' and '.join(frozen)} are held constant; limits are not included")
-    show.show_files(result)
-
-
-def _format_margin(name: str, system: System) -> str:
-    value = system.margins.numbers()[name]
-    if math.isnan(value):
-        return "undecided" if name == "delay" and system.margins.stable else "none"
-    return "no limit" if value == math.inf else f"{value * SHOWN_IN.get(name, 1.0):.4g}"
-
-
-def _format_place(values: dict[str, float], scenario: Scenario) -> str:
-    units = {path: spec.unit for path, (spec, _) in parameters_of(scenario.loop).items()}
-    words = []
-    for path, value in values.items():
-        scale, unit = (KMH, "km/h") if units[path] == "m/s" else (1.0, units[path])
-        words.append(f"{path.rpartition('.')[2]} {scale * value:.4g} {unit}".strip())
-    return ", ".join(words)
-
-
 def _judge(scenario: Scenario, margins: ScenarioMargins) -> None:
     """Raise typer.Exit for a loop that is unstable, here or within the ranges."""
     if not margins.nominal.margins.stable:
         console.conclude(f"{scenario.name}: the closed loop is not stable: no margins")
     if unstable := margins.band.unstable:
-        first = _format_place(unstable[0].values, scenario)
+        first = show_margins.format_place(unstable[0].values, scenario)
         count = f"{len(unstable)} of {len(margins.band.systems)} systems"
         console.conclude(f"{scenario.name}: not stable in {count} of the ranges, as at {first}")

@@ -66,20 +66,15 @@ def prove(
             raise ScenarioError(
                 f"--claim is needed: the plant has no slip; it has {', '.join(setup.loop.plant.shows._fields)}"
             )
-        far = [""]
         with targets.new_target_file(plot, "--plot") as picture:
             with targets.new_target_file(out, "--out") as file:
                 try:
                     equations = derive_equations(setup.loop, box)  # refuses before anything is simulated
                     claims = [read_claim(text, setup.loop, equations, "--claim") for text in claim or ()]
-                    proof = console.run_with_progress(
-                        lambda: prove_box(
-                            setup.loop, setup.solver, box, claims, budget,
-                            progress=lambda line: far.__setitem__(0, line),
-                        ),
+                    proof = console.run_with_lines(
+                        lambda tell: prove_box(setup.loop, setup.solver, box, claims, budget, progress=tell),
                         f"proving {setup.name}",
-                        lambda: far[0],
-                    )  # fmt: skip
+                    )
                 except (NoRule, NoCompiler) as error:
                     raise ScenarioError(str(error)) from None
                 result = result_document("prove", setup, proof.record(), "numpy")

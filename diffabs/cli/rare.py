@@ -48,13 +48,9 @@ def rare(
         study = section_sweep.build_study(setup)
         study = dataclasses.replace(study, engine=engine)
         try:
-            study, why = console.run_with_progress(
-                lambda: choose_metric_engine(study, metric), engines.COMPILING_KERNEL
-            )
+            study = engines.choose_engine(lambda: choose_metric_engine(study, metric))
         except ValueError as error:
             raise ScenarioError(str(error)) from None
-        if why:
-            console.say(engines.XLA_NOTE.format(why))
         event = _estimate(study, metric, bound, samples, gradients)
         values = describe_failures(event, study, metric, bound)
         result = result_document("rare", setup, values, "numpy", "scipy")

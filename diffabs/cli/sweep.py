@@ -7,21 +7,19 @@ runs.
 import contextlib
 import dataclasses
 import functools
-import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import jax
 import typer
 
-from diffabs.cli import console, progress, report, show, show_samples
+from diffabs.cli import console, progress, report, show, show_samples, sweep_files, sweep_options
 from diffabs.cli import engine as engines
-from diffabs.core.types import JsonObject, PyTree
+from diffabs.core.types import PyTree
 from diffabs.engine.drive.engine import EngineError
-from diffabs.host import documents, files, provenance
-from diffabs.host.values import unknown_name_error
+from diffabs.host import files
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.uncertainty.sweep.sampling import MAX_UINT32
@@ -29,9 +27,6 @@ from diffabs.uncertainty.sweep.sampling import MAX_UINT32
 if TYPE_CHECKING:
     from diffabs.uncertainty.sweep import Results, Study
     from diffabs.uncertainty.sweep import SweepProgress as Told
-
-PLACES = ("local", "dask")
-SUMMARY, FIGURES = "summary.json", "figures"
 
 
 def sweep(
@@ -53,14 +48,18 @@ def sweep(
     keep: Annotated[
         str | None, typer.Option(metavar="N,N,...", help="Samples whose trajectories are kept (zarr).")
     ] = None,
-    figures: Annotated[bool, typer.Option("--figures", help=f"Draw figures into DIR/{FIGURES}.")] = False,
+    figures: Annotated[bool, typer.Option("--figures", help=f"Draw figures into DIR/{sweep_files.FIGURES}.")] = False,
     as_json: console.Json = False,
 ) -> None:
     """Run a scenario for many samples, and show statistics.
 
     Parameters vary as [sweep.over] says. Statistics have confidence intervals."""
     with console.end_on_errors():
-        _check_options(on, scheduler, workers, devices, figures)
+        console.need_extra("sweep")
+        sweep_options.check_place(on, scheduler, workers, devices)
+        if figures:
+            console.need_matplotlib()
+            console.need_extra("report")
         if samples is not None and not 1 <= samples <= MAX_UINT32:
             console.fail(f"--samples {samples} is outside [1, {MAX_UINT32}]")
         if devices:
@@ -77,20 +76,23 @@ def sweep(
         if figures:
             report.check_target(out / report.DEFAULT_NAME)
         study = _with_engine(section_sweep.build_study(setup), engine, out, resume, remote=scheduler is not None)
-        numbers = _numbers(keep, study.samples)
+        numbers = sweep_options.read_sample_numbers(keep, study.samples)
         for number in numbers:
             study.accepted_lane(number)  # raises for a refused sample
         with _explain_resume(out, resume):
-            results = _run(study, setup, out, resume, lambda: _computer(on, scheduler, workers))
+            results = _run(study, setup, out, resume, lambda: sweep_options.build_place(on, scheduler, workers))
             show_samples.warn_of_strays(results)
             if not results.complete:
                 raise KeyboardInterrupt
             check = setup.sweep.check
-            result = console.run_with_progress(lambda: _result(results, study, out, check), "computing statistics")
+            result = console.run_with_progress(
+                lambda: sweep_files.write_statistics(results, study, out, check), "computing statistics"
+            )
             show_result = functools.partial(show.show_result, as_json, show_samples.show_sweep, result, setup)
             with console.show_before_errors(show_result):
                 console.run_with_progress(
-                    lambda: _write_files(result, results, study, out, numbers, figures), "writing the results"
+                    lambda: sweep_files.write_files(result, results, study, out, numbers, figures),
+                    "writing the results",
                 )
         show_result()
         from diffabs.uncertainty.sweep.checking import accuracy_warnings
@@ -118,31 +120,6 @@ def _explain_resume(out: pathlib.Path, resume: bool) -> Iterator[None]:
         raise typer.Exit(console.INTERRUPTED) from None
 
 
-def _check_options(on: str, scheduler: str | None, workers: int | None, devices: int | None, figures: bool) -> None:
-    console.need_extra("sweep")
-    if on not in PLACES:
-        raise unknown_name_error(f"--on {on} is unknown", on, PLACES)
-    if on == "dask":
-        console.need_extra("cluster")
-    for option, value, needed in (
-        ("--scheduler", scheduler, "dask"),
-        ("--workers", workers, "dask"),
-        ("--devices", devices, "local"),
-    ):
-        if value is not None and on != needed:
-            console.fail(f"{option} {value} needs --on {needed}")
-    limit = max(8, 2 * (os.cpu_count() or 1))
-    for option, value in (("--workers", workers), ("--devices", devices)):
-        if value is not None and not 1 <= value <= limit:
-            why = ": more than twice the processors only cost memory" if value > limit else ""
-            console.fail(f"{option} {value} is outside [1, {limit}]{why}")
-    if scheduler and workers:
-        console.fail(f"--workers {workers}: the scheduler at {scheduler} has its own workers")
-    if figures:
-        console.need_matplotlib()
-        console.need_extra("report")
-
-
 def _check_free(out: pathlib.Path, resume: bool) -> None:
     """Raise SweepError if a new sweep cannot begin in the folder."""
     from diffabs.uncertainty.sweep.store import Store
@@ -151,46 +128,21 @@ def _check_free(out: pathlib.Path, resume: bool) -> None:
         Store(out).check_free()
 
 
-def _numbers(keep: str | None, samples: int) -> list[int]:
-    """Return the sample numbers of --keep. Raises typer.Exit."""
-    try:
-        numbers = [int(text) for text in keep.split(",")] if keep else []
-    except ValueError:
-        console.fail(f"--keep {keep} is no list of sample numbers N,N,...")
-    wrong = [n for n in numbers if not 0 <= n < samples]
-    if wrong:
-        console.fail(f"--keep {wrong[0]} is outside [0, {samples - 1}]")
-    return numbers
-
-
 def _with_engine(study: "Study", engine: str, out: pathlib.Path, resume: bool, remote: bool) -> "Study":
     """Return the study with its engine, "xla" or "kernel". A line on stderr says why "auto" became XLA."""
     from diffabs.uncertainty.sweep.runner import find_study_objection
     from diffabs.uncertainty.sweep.selection import choose_study_engine
 
-    study, why = console.run_with_progress(
+    study = engines.choose_engine(
         lambda: choose_study_engine(
             dataclasses.replace(study, engine=engine).check(), out, resume=resume, remote=remote
-        ),
-        engines.COMPILING_KERNEL,
+        )
     )
-    if why:
-        console.say(engines.XLA_NOTE.format(why))
     if study.engine == "kernel" and (
         line := console.run_with_progress(lambda: find_study_objection(study), engines.COMPILING_KERNEL)
     ):
         console.fail(line)
     return study
-
-
-def _computer(name: str, scheduler: str | None, workers: int | None) -> Any:
-    from diffabs.uncertainty.sweep.engines import Local
-
-    if name == "local":
-        return Local()
-    from diffabs.uncertainty.sweep.cluster import Dask
-
-    return Dask(scheduler, workers)
 
 
 def _run(study: "Study", scenario: Scenario, out: pathlib.Path, resume: bool, on: Callable[[], PyTree]) -> "Results":
@@ -210,42 +162,3 @@ def _run(study: "Study", scenario: Scenario, out: pathlib.Path, resume: bool, on
         return run(study, out, resume=resume, on=on(), progress=report_progress, stopping=ending, source=source)
 
     return console.run_with_progress(run, f"sweeping {scenario.name}", lambda: far[0], ending)
-
-
-def _result(results: "Results", study: "Study", out: pathlib.Path, check: int) -> JsonObject:
-    """Return the JSON document, which is also written into the folder: at first without the names of other files.
-
-    A picture that cannot be drawn then loses no statistics.
-    """
-    from diffabs.uncertainty.sweep.statistics.summary import summarise_checked_sweep
-
-    values = {"out": str(out), **summarise_checked_sweep(results, study, check)}
-    result = documents.stamp("sweep", {**values, "made": provenance.describe_command(), "files": {}})
-    _write_summary(out, result)
-    return result
-
-
-def _write_files(
-    result: JsonObject, results: "Results", study: "Study", out: pathlib.Path, numbers: list[int], figures: bool
-) -> None:
-    """Write trajectories, figures and report, and add their names to the document here and in the folder."""
-    from diffabs.uncertainty.sweep.trajectories import write_trajectories
-
-    if numbers:
-        result["files"]["trajectories"] = str(write_trajectories(study, out, numbers))
-    if figures:
-        from diffabs.output.plot.sweeps import draw_sweep
-
-        folder = out / FIGURES
-        folder.mkdir(exist_ok=True)
-        result["files"]["figures"] = [str(path) for path in draw_sweep(results, result, folder, study.units())]
-        result["files"]["report"] = str(out / report.DEFAULT_NAME)
-    if result["files"]:
-        _write_summary(out, result)
-    if figures:
-        report.write_report_file([out], out / report.DEFAULT_NAME)
-
-
-def _write_summary(out: pathlib.Path, result: JsonObject) -> None:
-    # The sweep's lock is released by now: another --resume of a complete sweep may write the same file.
-    files.write_synced(out / SUMMARY, documents.format_document(result, 1).encode())

@@ -126,9 +126,7 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
     max_iterations = None if work.constraints else goal.iterations  # with constraints the number of rounds is unknown
 
     problem = build_tuning(work, engine)
-    _, reason = console.run_with_progress(problem.find_engine, engines.COMPILING_KERNEL)
-    if reason:
-        console.say(engines.XLA_NOTE.format(reason))
+    engines.choose_engine(problem.find_engine)
 
     def run_tuning() -> "Tuned":
         return tune.tune(problem, method=method, progress=history.append, stopping=ending)

@@ -12,7 +12,7 @@ from seams import replace_seam
 from small_scenarios import IDENTIFY as SMALL
 
 import diffabs.tune.identify.identification as library
-from diffabs.cli import identify as commands_identify
+from diffabs.cli import identify_options
 from diffabs.core.protocols import BrakeOutput
 from diffabs.scenario.measurements import read_measurements
 from diffabs.scenario.scenario import ScenarioError, load
@@ -181,8 +181,8 @@ def test_noise_that_is_not_known_is_taken_from_the_residuals(small, csv, invente
 
 def test_columns_that_follow_from_each_other_are_said_to(small, csv, invented):
     path = csv("t [s],wheel_speed [m/s],slip [1],speed [m/s]", *ROWS)
-    assert commands_identify.REDUNDANT in run("identify", small, "--data", path, *FREE).stderr
-    assert commands_identify.REDUNDANT not in run("identify", small, "--data", path, *FREE, "--column", "slip").stderr
+    assert identify_options.REDUNDANT in run("identify", small, "--data", path, *FREE).stderr
+    assert identify_options.REDUNDANT not in run("identify", small, "--data", path, *FREE, "--column", "slip").stderr
 
 
 def test_one_column_only(small, csv, invented):
@@ -321,14 +321,14 @@ def test_a_limit_that_a_simulation_lacks_is_not_measured(csv):
 
 
 @killed_by("scenario.measurements", "            if name in self.infinite:", "            if False:")
-@killed_by("cli.identify", "if readings.infinite and not names:", "if False:")
+@killed_by("cli.identify_options", "if readings.infinite and not names:", "if False:")
 def test_a_column_that_is_left_out_is_named(csv, capsys):
     path, units = csv("t [s],psi [rad],current_max [A]", "0,0.1,inf", "0.1,0.2,inf"), {"psi": "rad", "current_max": "A"}
-    found = commands_identify._compared_columns(path, None, units)
+    found = identify_options.read_columns(path, None, units)
     assert list(found.columns) == ["psi"]
     line = "note: current_max is infinite in every row of the data, and is not compared\n"
     assert capsys.readouterr().err == line
-    commands_identify._compared_columns(path, ["psi"], units)
+    identify_options.read_columns(path, ["psi"], units)
     assert capsys.readouterr().err == ""
     with pytest.raises(ScenarioError, match="--column current_max is infinite in every row of the data"):
-        commands_identify._compared_columns(path, ["current_max"], units)
+        identify_options.read_columns(path, ["current_max"], units)

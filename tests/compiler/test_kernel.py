@@ -324,7 +324,7 @@ class TestSweep:
 
     @killed_by("cli.sweep", "study, engine=engine).check()", "study).check()", case="kernel-")
     @killed_by("cli.sweep", '    if study.engine == "kernel" and (', "    if False and (", case="kernel-")
-    @killed_by("cli.sweep", "    if why:\n", "    if False:\n", case="auto-note: runs are made by XLA:")
+    @killed_by("cli.engine", "    if why:\n", "    if False:\n", case="auto-note: runs are made by XLA:")
     @pytest.mark.slow
     @pytest.mark.parametrize(("engine", "line"), [("auto", "note: runs are made by XLA:"), ("kernel", "")])
     def test_by_the_command(self, engine, line, users_engine, tmp_path, monkeypatch):

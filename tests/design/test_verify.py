@@ -18,7 +18,7 @@ from marks import readable_id
 from mutants import killed_by
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-from diffabs.cli import design
+from diffabs.cli import verify as command_verify
 from diffabs.robust.design import verify
 from diffabs.robust.design.polytopes import Polytope, Schedule
 from diffabs.robust.design.proof.certificate import Certificate, Claim
@@ -348,7 +348,7 @@ def test_what_takes_too_long_is_refused(given, tmp_path):
 def test_the_command_takes_as_long_as_the_library():
     (option,) = [
         one.default
-        for name, one in inspect.signature(design.verify_certificate).parameters.items()
+        for name, one in inspect.signature(command_verify.verify_certificate).parameters.items()
         if name == "seconds"
     ]
     assert option == verify.MAX_SECONDS

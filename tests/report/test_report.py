@@ -390,7 +390,7 @@ def test_the_command_says_where_it_is(results, tmp_path):
     assert left_in(tmp_path) == {"mine.html"}
 
 
-@killed_by("cli.sweep", "report.write_report_file([out], out / report.DEFAULT_NAME)", "pass")
+@killed_by("cli.sweep_files", "report.write_report_file([out], out / report.DEFAULT_NAME)", "pass")
 @pytest.mark.slow
 def test_a_sweep_with_figures_writes_its_report(results):
     text = (results / "sweep" / "report.html").read_text(encoding="utf-8")
@@ -461,7 +461,7 @@ def test_a_metric_that_a_half_step_turns_is_in_the_report(tmp_path):
     assert "margin is finite with one step and never with the other in 2 of 3 runs, the first sample 5" in text
 
 
-@killed_by("cli.sweep", "    _write_summary(out, result)\n    return result", "    return result")
+@killed_by("cli.sweep_files", "    _write_summary(out, result)\n    return result", "    return result")
 @killed_by("cli.sweep", "with console.show_before_errors(show_result):", "if True:")
 @pytest.mark.slow
 def test_a_sweep_whose_figure_fails_keeps_its_summary(tmp_path, monkeypatch):
