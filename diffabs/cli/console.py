@@ -11,7 +11,7 @@ import textwrap
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import Annotated, NoReturn, TypeVar
 
 import typer
 from rich.console import Console
@@ -325,7 +325,7 @@ def leave(status: str | int | None) -> NoReturn:
     raise SystemExit(status)
 
 
-def add_option_overrides(changes: Sequence[str] | None, section: str, **fields: Any) -> list[str]:
+def add_option_overrides(changes: Sequence[str] | None, section: str, **fields: object) -> list[str]:
     """Return the overrides of --set, followed by those of separate options such as --seed; None is left out."""
     return [*(changes or ()), *(f"{section}.{name}={value}" for name, value in fields.items() if value is not None)]
 

@@ -43,7 +43,7 @@ class Node:
 
     __slots__ = ("args", "attr", "dtype", "id", "label", "level", "op")
 
-    def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: Any, level: UpdateLevel):
+    def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: object, level: UpdateLevel):
         """Store the fields. Only a `Graph` creates nodes."""
         self.id: int = id
         self.op: str = op
@@ -95,7 +95,7 @@ class Graph:
             self._by_key[key] = self.nodes[-1]
         return self._by_key[key]
 
-    def const(self, value: Any, dtype: DTypeLike | None = None) -> Node:
+    def const(self, value: object, dtype: DTypeLike | None = None) -> Node:
         """Return the constant `value` of type `dtype`."""
         x = np.asarray(value, dtype)[()]
         # The key has the bytes, because 0 == -0 and NaN != NaN.

@@ -16,6 +16,9 @@ from diffabs.compiler.program import ScalarProgram, keep_read, lower_functions
 from diffabs.compiler.trace import TracedFunctions
 from diffabs.core.types import PyTree
 
+# The arrays with initial tangents, as (level, index); None for values alone.
+Seeds = tuple[tuple[UpdateLevel, int], ...] | None
+
 
 class LanePrograms:
     """The functions of a kernel with their program without tangents and, on demand, programs with tangents.
@@ -44,7 +47,7 @@ class LanePrograms:
         self._derivatives: dict[PyTree, PyTree] = {}
         self.derivative(None)
 
-    def derivative(self, seeds: tuple[tuple[UpdateLevel, int], ...] | None) -> DerivativeProgram:
+    def derivative(self, seeds: Seeds) -> DerivativeProgram:
         """Return the program with one tangent direction, or the program without tangents for `seeds` = None.
 
         `seeds` lists as (level, index) the arrays whose initial tangents are given; all other initial tangents are 0.
@@ -59,7 +62,7 @@ class LanePrograms:
             )
         return self._derivatives[seeds]
 
-    def program(self, seeds: PyTree, many: int, as_lanes: frozenset[int]) -> ScalarProgram:
+    def program(self, seeds: Seeds, many: int, as_lanes: frozenset[int]) -> ScalarProgram:
         """Return the program to launch, with `many` tangent directions and without updates that nothing reads.
 
         `seeds` is as in `derivative`. `as_lanes` holds the indices of the uniform arrays that vmap has given a value
@@ -79,11 +82,11 @@ class LanePrograms:
         """Keys of the values among the primitive's arguments, in their order: uniform, lane, carry."""
         return [ArrayKey(level, i, False) for level in INPUT_LEVELS for i in range(len(self.functions.types[level]))]
 
-    def seed_keys(self, seeds: PyTree) -> list[ArrayKey]:
+    def seed_keys(self, seeds: Seeds) -> list[ArrayKey]:
         """Return the keys of the initial tangents of the arrays in `seeds`; as arguments they follow the values."""
         return [ArrayKey(level, i, True) for level, i in seeds or ()]
 
-    def result_keys(self, seeds: PyTree) -> list[ArrayKey]:
+    def result_keys(self, seeds: Seeds) -> list[ArrayKey]:
         """Return the keys of the primitive's results for the initial tangents in `seeds`, in their order.
 
         These are all arrays of the carry, and then the tangents that can be nonzero and influence a wanted array.

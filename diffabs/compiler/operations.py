@@ -36,7 +36,7 @@ class Operation(NamedTuple):
     compares: bool = False
 
 
-def _divide_towards_zero(x: PyTree, y: PyTree) -> PyTree:
+def _divide_towards_zero(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the integer quotient x / y, rounded towards zero as in C; NumPy's // rounds down."""
     return x // y + ((x % y != 0) & ((x < 0) != (y < 0)))
 

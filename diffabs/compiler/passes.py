@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 from diffabs.compiler.autodiff.jvp import arrange_arrays
 from diffabs.compiler.emit.cpp import emit_cpp
 from diffabs.compiler.ir import UpdateLevel
-from diffabs.compiler.lane_programs import LanePrograms
+from diffabs.compiler.lane_programs import LanePrograms, Seeds
 from diffabs.compiler.listing import ArrayPaths, list_program, list_schedule
 from diffabs.compiler.program import ScalarProgram
 from diffabs.compiler.runtime.jax_primitive import run_lanes_primitive
 from diffabs.compiler.trace import TracedFunctions
-from diffabs.core.types import PyTree
 
 PASSES = ("trace", "lower", "jvp", "eliminate", "schedule", "c")
 
@@ -28,7 +27,7 @@ class LaneCall(NamedTuple):
     """
 
     lanes: LanePrograms
-    seeds: PyTree
+    seeds: Seeds
     many: int
     as_lanes: frozenset[int]
 

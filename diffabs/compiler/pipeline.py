@@ -35,7 +35,7 @@ from diffabs.compiler.program import ScalarProgram
 from diffabs.compiler.runtime import cpu, gpu, toolchain
 from diffabs.compiler.runtime.jax_primitive import bind_lanes
 from diffabs.compiler.trace import trace_functions
-from diffabs.core.types import Any, Array, PyTree, Scalar
+from diffabs.core.types import Array, PyTree, Scalar
 
 VECTORS_PER_BLOCK = 4
 
@@ -140,6 +140,6 @@ def unwrap_key(x: Array) -> Scalar:
     return x if isinstance(x, jax.Array) else jnp.asarray(x)
 
 
-def is_key(x: Any) -> bool:
+def is_key(x: Array) -> bool:
     """Return whether an array holds random keys."""
     return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

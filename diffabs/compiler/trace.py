@@ -4,9 +4,10 @@ Values that the functions close over are inputs, the same for all lanes. So new 
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
+import jax.extend.core as jex
 
 from diffabs.compiler.ir import UpdateLevel
 from diffabs.core.types import PyTree, Scalar
@@ -21,7 +22,7 @@ class TracedFunction(NamedTuple):
         constants: Values that become constants of the program. Only a derivative has them.
     """
 
-    jaxpr: Any
+    jaxpr: jex.Jaxpr
     closed: tuple[int, ...]
     constants: tuple[PyTree, ...] = ()
 

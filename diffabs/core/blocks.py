@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,8 @@ from diffabs.core.protocols import Block, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import part, pytree
 from diffabs.core.types import Int, Part, PyTree, Scalar
 
+T = TypeVar("T")
+
 
 @pytree
 class Direct:
@@ -21,7 +23,7 @@ class Direct:
     start = no_memory
     flow = no_flow
 
-    def output(self, t: Scalar, memory: Memory, signal: object) -> PyTree:
+    def output(self, t: Scalar, memory: Memory, signal: T) -> T:
         """Return the signal."""
         del t, memory
         return signal
@@ -41,7 +43,7 @@ class Series:
             signal = block.output(0.0, memories[-1], signal)
         return _join_memories(memories)
 
-    def flow(self, t: Scalar, memory: Memory, signal: object) -> PyTree:
+    def flow(self, t: Scalar, memory: Memory, signal: object) -> tuple[PyTree, ...]:
         """Return the rates of the blocks."""
         rates = []
         for block, m in self._pairs(memory):
@@ -49,7 +51,7 @@ class Series:
             signal = block.output(t, m, signal)
         return tuple(rates)
 
-    def output(self, t: Scalar, memory: Memory, signal: object) -> PyTree:
+    def output(self, t: Scalar, memory: Memory, signal: T) -> T:
         """Return the output of the last block."""
         for block, m in self._pairs(memory):
             signal = block.output(t, m, signal)
@@ -111,7 +113,7 @@ class Series:
             memories.append(m)
         return _join_memories(memories)
 
-    def _pairs(self, memory: Memory) -> Any:
+    def _pairs(self, memory: Memory) -> list[tuple[PyTree, PyTree]]:
         return [(b, Memory(f, h)) for b, f, h in zip(self.blocks, memory.flow, memory.held, strict=True)]
 
 

@@ -54,7 +54,7 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, PyTree] | 
     return decorate
 
 
-def is_traced(*trees: PyTree) -> bool:
+def is_traced(*trees: object) -> bool:
     """Return whether a jit trace is under way, or a leaf of the trees is a tracer, as under grad and vmap."""
     return _is_tracing() or any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
 

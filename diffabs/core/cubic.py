@@ -135,7 +135,7 @@ class HermiteStep(NamedTuple):
         return jax.tree.map(lambda a, b, p, q: Cubic(a, b, h * p, h * q)(x), *self.values, *self.rates)
 
 
-def _refine_zero(x: Scalar, function: Callable[[PyTree], PyTree], slope: Scalar) -> PyTree:
+def _refine_zero(x: Scalar, function: Callable[[PyTree], PyTree], slope: Scalar) -> Scalar:
     """Return x unchanged in value, with the derivatives of the zero of `function` near x.
 
     They are the derivatives of a Newton step, and their order is twice the order of x.

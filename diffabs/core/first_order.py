@@ -6,6 +6,7 @@ the wrapper of the output, a second pass in reverse mode that of the input.
 """
 
 from functools import partial
+from typing import NoReturn
 
 import jax
 import jax.extend.core as jex
@@ -19,7 +20,7 @@ _operation = jex.Primitive("first_order")
 def first_order(tangents: object, why: str) -> PyTree:
     """Return tangents unchanged; their differentiation raises a ValueError with the message `why`."""
 
-    def each(x: Scalar) -> PyTree:
+    def each(x: Scalar) -> Scalar:
         return x if getattr(x, "dtype", None) == jax.dtypes.float0 else _operation.bind(x, why=why)
 
     return jax.tree.map(each, tangents)
@@ -42,7 +43,7 @@ def _raise_for_parameter(path: str, at: object, moves: object) -> tuple[PyTree, 
     )
 
 
-def _raise_for_second_derivative(at: object, moves: object, *, why: str) -> PyTree:
+def _raise_for_second_derivative(at: object, moves: object, *, why: str) -> NoReturn:
     del at, moves
     raise ValueError(why)
 

@@ -1,7 +1,7 @@
 """JAX helpers for the body of a step: conditions of a whole batch, units of compilation, and checkpoints."""
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import jax
 import jax.custom_batching
@@ -25,7 +25,7 @@ def any_lane(running: Bool) -> Bool:
 
 
 @any_lane.def_vmap
-def _(size: int, batched: Any, running: Bool) -> tuple[PyTree, bool]:
+def _(size: int, batched: Sequence[bool], running: Bool) -> tuple[PyTree, bool]:
     del size
     # The result is unbatched, and `any_lane` again covers a further `vmap` around this one.
     return (any_lane(jnp.any(running, axis=0)), False) if batched[0] else (any_lane(running), False)
@@ -41,7 +41,7 @@ def jit_barrier(active: Bool, work: Callable[[], X]) -> X:
     return jax.lax.cond(any_lane(active), work, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape))
 
 
-def rematerialise(body: Any, keeps_decisions: bool = False) -> PyTree:
+def rematerialise(body: Callable[..., PyTree], keeps_decisions: bool = False) -> Callable[..., PyTree]:
     """Return `body` with checkpointing: reverse mode keeps its arguments, and its decisions if `keeps_decisions`.
 
     It computes everything else again.

@@ -6,6 +6,7 @@ name the new row. The solver writes it in place, at the end of a step or before 
 """
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -81,5 +82,5 @@ def _is_log(x: Scalar) -> bool:
     return isinstance(x, Log)
 
 
-def _map_logs(change: Any, tree: PyTree) -> Any:
+def _map_logs(change: Callable[[Log], Log], tree: object) -> Any:
     return jax.tree.map(lambda x: change(x) if _is_log(x) else x, tree, is_leaf=_is_log)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.types import Bool, PyTree, Scalar
+from diffabs.core.types import Array, Bool, Numbers, PyTree, Scalar, Vector
 
 T = TypeVar("T")
 
@@ -31,7 +31,7 @@ def larger(x: Scalar, y: Scalar) -> Scalar:
     return jnp.where(jnp.greater_equal(x, y), x, y)
 
 
-def later_of_larger(x: Scalar, y: Scalar, falls: Bool = False) -> PyTree:
+def later_of_larger(x: Scalar, y: Scalar, falls: Bool = False) -> Array:
     """Return max(x, y) of two successive values of a signal; where both are equal to rounding, it moves as y.
 
     At the end of a step of zero length, y moves with the event there, and x does not. If the signal falls at x, the
@@ -99,7 +99,7 @@ def _add_slope(x: Scalar, slope: Scalar, total: Scalar) -> Scalar:
 
 
 @_add_slope.defjvp
-def _slope_rule(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
+def _slope_rule(at: tuple[Array, ...], moves: PyTree) -> tuple[PyTree, PyTree]:
     x, slope, _ = at
     return x, moves[0] + (slope * moves[2]).astype(x.dtype)
 
@@ -111,7 +111,7 @@ def quotient(x: Scalar, y: Scalar) -> Scalar:
 
 
 @quotient.defjvp
-def _quotient_slope(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
+def _quotient_slope(at: tuple[Numbers, ...], moves: tuple[Numbers, ...]) -> tuple[PyTree, PyTree]:
     inverse = 1.0 / at[1]
     value = at[0] / at[1]
     return value, (moves[0] - value * moves[1]) * inverse
@@ -157,7 +157,7 @@ def odd(curve: Callable[[PyTree], PyTree], x: Scalar) -> Scalar:
     return s * curve(s * x)
 
 
-def interval_shares(x: Scalar, nodes: PyTree) -> Scalar:
+def interval_shares(x: Scalar, nodes: Vector) -> Scalar:
     """Return the share of each interval between increasing nodes (n,) that lies below x, from 0 to 1, shape (n - 1,).
 
     `interpolate_shares` sums over the shares. It looks up no index, so its derivatives need no scatter.
@@ -166,7 +166,7 @@ def interval_shares(x: Scalar, nodes: PyTree) -> Scalar:
     return jnp.where(x >= nodes[1:], 1.0, jnp.where(x < nodes[:-1], 0.0, inside))
 
 
-def interpolate_shares(risen: Scalar, values: PyTree) -> Scalar:
+def interpolate_shares(risen: Scalar, values: Vector) -> Scalar:
     """Return the piecewise linear interpolant of values (n,) at the nodes of `interval_shares`, constant beyond."""
     return values[0] + jnp.sum(risen * jnp.diff(values))
 

@@ -1,10 +1,10 @@
 """Packages that a user may have or not."""
 
 import importlib
-from typing import Any
+from types import ModuleType
 
 
-def import_optional(name: str) -> Any:
+def import_optional(name: str) -> ModuleType:
     """Return a package that no extra of diffabs brings, or raise a ModuleNotFoundError of one line."""
     try:
         return importlib.import_module(name)

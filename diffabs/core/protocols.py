@@ -224,13 +224,13 @@ class Objective(Protocol):
         ...
 
 
-def no_memory(self: Part, signal: PyTree) -> Memory:
+def no_memory(self: object, signal: object) -> Memory:
     """Return an empty memory: `start` of a block without memory."""
     del self, signal
     return Memory()
 
 
-def no_flow(self: Part, t: Scalar, memory: Memory, signal: PyTree) -> PyTree:
+def no_flow(self: object, t: Scalar, memory: Memory, signal: object) -> tuple[()]:
     """Return no rates: `flow` of a block without continuous memory."""
     del self, t, memory, signal
     return ()

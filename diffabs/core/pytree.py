@@ -178,7 +178,7 @@ def _register(cls: type, data: list[str], meta: list[str]) -> None:
         leaves, statics = flatten(part)
         return tuple(zip(map(jax.tree_util.GetAttrKey, data), leaves, strict=True)), statics
 
-    def unflatten(statics: tuple[PyTree, ...], leaves: Iterable[PyTree]) -> Any:
+    def unflatten(statics: tuple[PyTree, ...], leaves: Iterable[PyTree]) -> object:
         return cls(**dict(zip(data, leaves, strict=True)), **dict(zip(meta, statics, strict=True)))
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
@@ -358,7 +358,7 @@ def canonical_dtypes(tree: T) -> T:
         return structure.unflatten([as_array(x, dtype) for x in leaves])
 
 
-def prepare_parts(part: object) -> PyTree:
+def prepare_parts(part: T) -> T:
     """Return the part ready for a run: each part in it with a method `prepared()` is replaced by the method's result.
 
     The results hold precomputed values that stay constant during a run. Differentiable; a run does it once, inside its
@@ -367,7 +367,7 @@ def prepare_parts(part: object) -> PyTree:
     return _rebuild_parts(part, "prepared", lambda prefix: ())
 
 
-def refine_parts(part: object, times: int) -> PyTree:
+def refine_parts(part: T, times: int) -> T:
     """Return the part for shorter steps: each part in it with a method `refined(times)` is replaced by its result.
 
     Such a part has a memory that covers a number of steps.
@@ -375,7 +375,7 @@ def refine_parts(part: object, times: int) -> PyTree:
     return _rebuild_parts(part, "refined", lambda prefix: (times,))
 
 
-def prepare_derivatives(part: object, paths: Iterable[str]) -> PyTree:
+def prepare_derivatives(part: T, paths: Iterable[str]) -> T:
     """Return the part for derivatives by the parameters at these paths.
 
     Each part in it with a method `enable_derivatives(names)` is replaced by the method's result. `names` are the paths

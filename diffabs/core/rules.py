@@ -5,12 +5,12 @@ are evaluated with concrete numbers, or traced, for all runs of a batch in one c
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from diffabs.core.arrays import as_rule_array
-from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.core.types import Bool, Part, PyTree, Scalar
 from diffabs.core.units import Units, insert_unit
 
 MAX_SHOWN_NUMBERS = 8  # numbers of a list in a message
@@ -26,7 +26,7 @@ class Rule(NamedTuple):
             `{control}` or `{signal}` in it stands for the unit of the loop's control or signal.
     """
 
-    holds: Any
+    holds: Bool
     broken: str
     says: Callable[[], str]
 

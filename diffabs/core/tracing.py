@@ -12,7 +12,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from diffabs.core.first_order import first_order
 from diffabs.core.pytree import parameters
-from diffabs.core.types import PyTree
+from diffabs.core.types import Params, PyTree
 
 
 def differentiated_paths(tangents: object) -> frozenset[str]:
@@ -87,7 +87,7 @@ def used_inputs(program: Any, passes: Callable[[Any], bool] = lambda step: True)
 
 
 def read_leaves(
-    function: Callable[[PyTree, PyTree], PyTree], fixed: PyTree, batch: PyTree, *, differentiably: bool = False
+    function: Callable[[PyTree, PyTree], PyTree], fixed: object, batch: object, *, differentiably: bool = False
 ) -> PyTree:
     """Return a pytree of bools: whether function(fixed, batch) of one member depends on each leaf of `batch`.
 
@@ -108,7 +108,7 @@ def read_leaves(
     return tree.unflatten([is_used and counts(atom) for atom, is_used in inputs][-len(leaves) :])
 
 
-def scan_input_counts(params: Any, inputs: int) -> tuple[int, int]:
+def scan_input_counts(params: Params, inputs: int) -> tuple[int, int]:
     """Return how many inputs of a scan are constants and how many are carried, from the primitive's parameters.
 
     Until JAX 0.10 these are numbers. Later versions store a structure with three groups of inputs, in their order.

@@ -15,7 +15,7 @@ import numpy as np
 from diffabs.core import kinds
 from diffabs.core.pytree import ParameterSpec, children, parameters, stack_lists
 from diffabs.core.rules import Rule
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Scalar
 from diffabs.core.units import Units, insert_unit, units_inside, units_of
 
 T = TypeVar("T")
@@ -73,13 +73,13 @@ def find_broken(rules: Iterable[Rule]) -> Iterator[str]:
     yield from (rule.says() for rule in rules if not bool(rule.holds))
 
 
-def _from_hook(part: object, hook: str, *args: PyTree) -> Iterator[Any]:
+def _from_hook(part: object, hook: str, *args: object) -> Iterator[Any]:
     """Yield the rules or lines from a method of this part alone."""
     if hasattr(part, hook):
         yield from getattr(part, hook)(*args)
 
 
-def _below(part: object, prefix: str, units: Units | None, hook: str, *args: PyTree) -> Iterator[Any]:
+def _below(part: object, prefix: str, units: Units | None, hook: str, *args: object) -> Iterator[Any]:
     """Yield the rules or lines from a method of the part and of the parts in it, the innermost first."""
     for name, field, value in children(part, prefix):
         if field is None or "spec" not in field.metadata:

@@ -11,7 +11,7 @@ import math
 import os
 import re
 import sys
-from typing import Any
+from typing import Any, NoReturn
 
 from diffabs.core.types import JsonObject
 from diffabs.host import files
@@ -35,7 +35,7 @@ def stamp(kind: str, content: JsonObject) -> JsonObject:
     return {"format": f"diffabs {kind} {VERSION}", **content}
 
 
-def kind_of(content: Any) -> str:
+def kind_of(content: object) -> str:
     """Return the kind of a document; empty without a format of this package.
 
     Raises:
@@ -50,7 +50,7 @@ def kind_of(content: Any) -> str:
     return match[1]
 
 
-def format_document(content: Any, indent: int | None = 2) -> str:
+def format_document(content: object, indent: int | None = 2) -> str:
     """Return the JSON text of a document; a number without a form in JSON becomes null.
 
     Args:
@@ -63,7 +63,7 @@ def format_document(content: Any, indent: int | None = 2) -> str:
         return json.dumps(replace_infinite(content), indent=indent, allow_nan=False)
 
 
-def replace_infinite(value: Any) -> Any:
+def replace_infinite(value: object) -> object:
     """Return values with null in place of NaN and infinity, which JSON lacks."""
     if isinstance(value, dict):
         return {str(key): replace_infinite(item) for key, item in value.items()}
@@ -110,7 +110,7 @@ def _read_integer(text: str) -> int:
     return value
 
 
-def _refuse_constant(word: str) -> Any:
+def _refuse_constant(word: str) -> NoReturn:
     raise ValueError(f"{word} is not a finite number")
 
 

@@ -7,7 +7,6 @@ import contextlib
 import threading
 import time
 from collections.abc import Iterator
-from typing import Any
 
 import jax.monitoring
 
@@ -49,7 +48,7 @@ def count_compilations() -> None:
         jax.monitoring.register_event_duration_secs_listener(_add_duration)
 
 
-def _add_duration(event: str, duration_secs: float, **more: Any) -> None:
+def _add_duration(event: str, duration_secs: float, **more: object) -> None:
     del more
     if event.startswith(COMPILE_EVENT):
         now = time.monotonic()

@@ -9,7 +9,7 @@ At a kink the slopes of both sides differ, and rounding would choose one of them
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,11 @@ from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.shapes import Float
-from diffabs.core.types import AnyArray, Array, Bool, PyTree, Scalar
+from diffabs.core.types import AnyArray, Array, Bool, Scalar
 from diffabs.parts.plants.wheel import FROZEN_OUTPUTS
+
+T = TypeVar("T")
+
 
 # Newton iterations that bring the remaining states to rest; one is enough where their equation is linear.
 REMAINING_STATE_ITERATIONS = 10
@@ -154,7 +157,7 @@ def check_kink(subject: str, kinked: Bool) -> None:
         raise ValueError(f"{subject}: a slope jumps here, at a kink: no linear model")
 
 
-def nan_at_kink(model: object, kinked: Bool) -> PyTree:
+def nan_at_kink(model: T, kinked: Bool) -> T:
     """Return a model, or NaN in its place at a kink."""
     return jax.tree.map(lambda x: jnp.where(kinked, jnp.nan, x), model)
 
@@ -175,7 +178,7 @@ def as_vectors(plant: Plant, state: object, control: Scalar) -> tuple[Callable[[
     return flow, x, u
 
 
-def _check_chart(by_x: Any, outputs: Sequence[str]) -> None:
+def _check_chart(by_x: Array, outputs: Sequence[str]) -> None:
     """Raise ValueError unless outputs and remaining states are as many as the states, and independent."""
     rows, columns = by_x.shape
     named = ", ".join(outputs)
@@ -203,7 +206,7 @@ def used_leaves(plant: Plant, state: object, outputs: Sequence[str]) -> list[boo
     """
     leaves, tree = jax.tree.flatten(state)
 
-    def select(*leaves: PyTree) -> list[Scalar]:
+    def select(*leaves: Array) -> list[Scalar]:
         y = plant.output(jax.tree.unflatten(tree, leaves))
         return [getattr(y, name) for name in outputs]
 

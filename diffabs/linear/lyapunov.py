@@ -9,7 +9,7 @@ operation is one vectorised loop. On a CPU, a LAPACK call per small matrix takes
 
 from functools import reduce
 from operator import add
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -99,7 +99,7 @@ def relative_residual(summed: Array, *terms: jax.Array) -> jax.Array:
 # Many small matrices: (rows, columns, batch)
 
 
-def frobenius_norm(X: jax.Array, axes: Any = (0, 1)) -> jax.Array:
+def frobenius_norm(X: jax.Array, axes: int | tuple[int, ...] = (0, 1)) -> jax.Array:
     """Return the Frobenius norm of each matrix; `axes` are those of rows and columns."""
     return jnp.sqrt(jnp.sum(X * X, axes))
 

@@ -10,6 +10,7 @@ controller without an integral gain.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -163,7 +164,7 @@ class _VectorLoop(NamedTuple):
 
     loop: Loop
     setpoint: Scalar
-    unravel: Any
+    unravel: Callable[[Array], PyTree]
 
     def track(self, z: Array) -> tuple[PyTree, Tracking]:
         loop, x = self.loop, self.unravel(z)

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.shapes import Bool, Float, Num
-from diffabs.core.types import Any, AnyArray, Array, Matrix, PyTree, Rows
+from diffabs.core.types import AnyArray, Array, Matrix, Rows
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.lyapunov import discrete_lyapunov as _discrete_lyapunov
 from diffabs.linear.lyapunov import lyapunov as _lyapunov
@@ -150,7 +150,12 @@ def symmetric_part(X: AnyArray) -> AnyArray:
 
 
 def _riccati(
-    solution: Callable, A: AnyArray | Rows, B: AnyArray | Rows, Q: AnyArray | Rows, R: AnyArray | Rows, S: Any
+    solution: Callable,
+    A: AnyArray | Rows,
+    B: AnyArray | Rows,
+    Q: AnyArray | Rows,
+    R: AnyArray | Rows,
+    S: AnyArray | Rows | None,
 ) -> Riccati:
     A, B, Q, R = as_float_arrays(A, B, Q, R)
     S = jnp.zeros_like(B) if S is None else as_float_arrays(S)[0].astype(B.dtype)
@@ -189,7 +194,9 @@ def _solve_discrete(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 @_solve_continuous.defjvp
-def _solve_continuous_jvp(data: PyTree, tangents: PyTree) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+def _solve_continuous_jvp(
+    data: tuple[Array, ...], tangents: tuple[Array, ...]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Solve Ac' dP + dP Ac + (derivative of the left side at constant P) = 0 for the tangent dP."""
     P, residual = _solve_continuous(*data)
 
@@ -203,7 +210,9 @@ def _solve_continuous_jvp(data: PyTree, tangents: PyTree) -> tuple[tuple[Array, 
 
 
 @_solve_discrete.defjvp
-def _solve_discrete_jvp(data: PyTree, tangents: PyTree) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+def _solve_discrete_jvp(
+    data: tuple[Array, ...], tangents: tuple[Array, ...]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Solve Ac' dP Ac - dP + (derivative of the left side at constant P) = 0 for the tangent dP."""
     P, residual = _solve_discrete(*data)
 

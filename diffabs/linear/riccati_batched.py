@@ -309,7 +309,7 @@ def _discrete_terms(A: Array, B: Array, Q: Array, S: Array, P: Array) -> tuple[A
     return times(transpose(A), PA), -P, -times(transpose(T), gain), Q
 
 
-def _kleinman(A: Array, B: Array, Q: Array, scale: Any, P: Array, *extra: Array) -> tuple[Any, ...]:
+def _kleinman(A: Array, B: Array, Q: Array, scale: Array, P: Array, *extra: Array) -> tuple[Any, ...]:
     """Return the size of the terms, the Newton step D, and one X for each E of `extra`.
 
         Ac' D + D Ac + (left side at P) = 0,     Ac' X + X Ac + E = 0

@@ -44,7 +44,7 @@ class Transfer(NamedTuple):
         """Poles (n,) of the rational part: in s, or in z if sampled."""
         return np.linalg.eigvals(self.A) if len(self.A) else np.zeros(0)
 
-    def rational_response(self, w: ArrayLike) -> Any:
+    def rational_response(self, w: ArrayLike) -> np.ndarray:
         """Return the response (k, p, m) at frequencies w (k,) [rad/s], without the delay; infinite at a pole."""
         w = np.atleast_1d(np.asarray(w, float))
         # z - A = (z - 1) - (A - 1) keeps the digits of slow modes, whose z is near 1.
@@ -54,7 +54,7 @@ class Transfer(NamedTuple):
         with np.errstate(all="ignore"):
             return self.C @ _solve_or_infinite(shifted, np.asarray(self.B, complex)) + self.D
 
-    def response(self, w: ArrayLike) -> Any:
+    def response(self, w: ArrayLike) -> np.ndarray:
         """Return the response (k, p, m) at frequencies w (k,) [rad/s]."""
         return self.rational_response(w) * np.exp(-1j * np.atleast_1d(np.asarray(w, float)) * self.delay)[:, None, None]
 

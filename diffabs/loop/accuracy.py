@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from diffabs.core.blocks import offers
 from diffabs.core.protocols import Clock, Memory, Objective
 from diffabs.core.pytree import refine_parts
-from diffabs.core.types import Bool, Int, Key, Part, PyTree, Scalar, Vector
+from diffabs.core.types import Array, Bool, Int, Key, Part, PyTree, Scalar, Vector
 from diffabs.engine.solvers import Solver, refine_solver
 from diffabs.loop.closed_loop import BLOCKS, Loop
 from diffabs.loop.result import Run
@@ -53,7 +53,7 @@ class ErrorEstimate(NamedTuple):
     value: Scalar
     difference: Scalar
     finer: Any
-    order: Any
+    order: Scalar
     converges: Bool
     error: Scalar
     turned: Bool
@@ -70,7 +70,7 @@ class Accuracy(NamedTuple):
 
     estimates: dict[str, ErrorEstimate]
     comparable: Bool
-    alike: Any
+    alike: Bool
 
 
 def estimate_accuracy(
@@ -100,7 +100,7 @@ def measure_finer(
     return measure(refine_parts(loop, times), refine_solver(solver, times), objectives, key=key)
 
 
-def runs_end_alike(*runs: Run) -> PyTree:
+def runs_end_alike(*runs: Run) -> Array:
     """Return True if no run diverged and either all or none of the runs reached their stop."""
     stopped = jnp.stack([run.stopped for run in runs])
     return ~jnp.stack([run.diverged for run in runs]).any(0) & (stopped.all(0) | ~stopped.any(0))

@@ -11,7 +11,7 @@ most. Before all these, `check` looks at the shapes of fields; of a batch, `run_
 import math
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once, is_trace
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.rules import Rule
-from diffabs.core.types import Params, Part, PyTree, Scalar
+from diffabs.core.types import Array, Params, Part, PyTree, Scalar
 from diffabs.core.validity import check_part as check_parts
 from diffabs.core.validity import find_broken, find_misshapen, grid_rules, part_rules
 from diffabs.engine.solvers import Adaptive, Solver, find_solver_faults
@@ -202,7 +202,7 @@ def _rules(loop: Loop, step: float) -> Iterator[Rule]:
 def _codes(loop: Loop | None, values: object, *, step: float) -> Scalar:
     """Return the number of the first broken rule of each run, from 1, shape (runs,); 0 if no rule is broken."""
 
-    def code(values: object) -> Any:
+    def code(values: object) -> Array:
         holds = jnp.stack([jnp.asarray(rule.holds) for rule in _rules(canonical_dtypes(_lane(loop, values)), step)])
         return jnp.where(jnp.all(holds), 0, 1 + jnp.argmin(holds))  # argmin finds the first False
 

@@ -16,6 +16,7 @@ from diffabs.core.summary import Summary
 from diffabs.core.types import AnyArray, Params, Part, PyTree
 from diffabs.engine.solvers import Solver
 from diffabs.loop.admissible import first_refusal
+from diffabs.loop.closed_loop import Loop
 
 MAX_LENGTH_RATIO = 2.0  # runs in one group differ by less than this factor in duration
 
@@ -87,7 +88,7 @@ class Batch:
             raise ValueError(f"a batch needs columns of the same length, with one value for each run: {listed}")
         return next(iter(lengths.values()), 1)
 
-    def check(self, loop: Part, solver: Solver | None = None) -> "Batch":
+    def check(self, loop: Loop, solver: Solver | None = None) -> "Batch":
         """Return the batch itself if its values fit the loop.
 
         Args:

@@ -140,7 +140,7 @@ def _follow_objective(path: str, objective: Objective, sample: Sample, ending: E
     _expect_reals(f"{path}.value", _call(path, objective, "value", memory, ending))
 
 
-def _call(path: str, part: object, method: str, *args: Any) -> Any:
+def _call(path: str, part: object, method: str, *args: object) -> Any:
     """Return the result of a method, or raise a Misfit with the reason why it fails.
 
     A ValueError of a packaged part is its message to the user, and is raised again unchanged.

@@ -2,7 +2,7 @@
 
 import csv
 import pathlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -14,6 +14,13 @@ from diffabs.core.summary import Summary, round_for_table
 from diffabs.core.types import Params, PyTree
 from diffabs.loop.closed_loop import LOOP_SIGNALS
 from diffabs.loop.faults import describe_faults
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+    from diffabs.loop.result import Run
+
 
 NUMBER_TYPES = (jax.Array, np.ndarray, np.generic, float, int, bool)
 DEFAULT_CONTROL_UNIT = "control"  # unit of the control if no plant is given
@@ -48,7 +55,7 @@ def summarise_run(run: PyTree) -> Summary:
     return Summary(f"Run that {how}{length}", ("metric", "value"), rows)
 
 
-def _summarise_runs(run: PyTree, count: int) -> Summary:
+def _summarise_runs(run: "Run", count: int) -> Summary:
     lost, stopped = np.asarray(run.diverged).reshape(-1), int(np.sum(run.stopped))
     rows = []
     for name, values in run.metrics.items():
@@ -79,7 +86,7 @@ def signal_columns(sample: Sample, plant: Plant | None = None) -> dict[str, tupl
     return {"t": ("s", sample.t), **outputs, **others}
 
 
-def trajectory_columns(run: PyTree, plant: Plant | None = None) -> dict[str, tuple[str, np.ndarray]]:
+def trajectory_columns(run: "Run", plant: Plant | None = None) -> dict[str, tuple[str, np.ndarray]]:
     """Return the `signal_columns` of one run up to its end; values have shape (instants,)."""
     if run.trajectory is None:
         raise ValueError("the run has no trajectory: make it with rollout")
@@ -90,7 +97,7 @@ def trajectory_columns(run: PyTree, plant: Plant | None = None) -> dict[str, tup
     return {name: (unit, np.asarray(values)[:rows]) for name, (unit, values) in columns.items()}
 
 
-def write_csv(path: pathlib.Path, run: PyTree, plant: Plant) -> None:
+def write_csv(path: pathlib.Path, run: "Run", plant: Plant) -> None:
     """Write the `trajectory_columns` of one run to a CSV file with twelve digits; its header has names and units."""
     columns = {f"{name} [{unit}]": values for name, (unit, values) in trajectory_columns(run, plant).items()}
     with path.open("w", encoding="utf-8", newline="\n") as file:
@@ -99,7 +106,7 @@ def write_csv(path: pathlib.Path, run: PyTree, plant: Plant) -> None:
             file.write(",".join(f"{value:.12g}" for value in row) + "\n")
 
 
-def to_pandas(run: PyTree, plant: Plant | None = None) -> Any:
+def to_pandas(run: "Run", plant: Plant | None = None) -> "pandas.DataFrame":
     """Return a pandas.DataFrame: the trajectory indexed by `t`, or without a trajectory one row per run.
 
     A trajectory has units, metrics and end flags in `attrs`. A row per run has the metrics and the end flags as
@@ -119,7 +126,7 @@ def to_pandas(run: PyTree, plant: Plant | None = None) -> Any:
     return frame
 
 
-def to_xarray(run: object, plant: Plant | None = None) -> Any:
+def to_xarray(run: "Run", plant: Plant | None = None) -> "xarray.Dataset":
     """Return the trajectory as an xarray.Dataset over `t` [s], with `units` of variables and the metrics in `attrs`."""
     xarray = import_optional("xarray")
 
@@ -128,14 +135,14 @@ def to_xarray(run: object, plant: Plant | None = None) -> Any:
     return xarray.Dataset(each, coords={"t": each.pop("t")}, attrs=_attributes(run))
 
 
-def to_figure(run: PyTree, plant: Plant | None = None, title: str = "") -> Any:
+def to_figure(run: "Run", plant: Plant | None = None, title: str = "") -> Any:
     """Return a matplotlib figure of the run. The signals of the plant's output select the kind of figure."""
     from diffabs.output.plot import draw_run  # upwards: the one such import, for the method of `Run`
 
     return draw_run(run, title=title, unit=plant.control_unit if plant is not None else "")
 
 
-def _attributes(run: PyTree) -> Params:
+def _attributes(run: "Run") -> Params:
     """Return metrics and end flags of a run as plain numbers."""
     flags = {name: int(getattr(run, name)) for name in ("stopped", "diverged", "timed_out")}
     return {**{name: float(value) for name, value in run.metrics.items()}, **flags}

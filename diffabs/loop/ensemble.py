@@ -19,6 +19,7 @@ from diffabs.core.types import Array, Bool, Key, Params, PyTree
 from diffabs.engine.drive.engine import check_process, resolve_request, run_with_engine
 from diffabs.engine.drive.packed import EarlyEnd, run_packed
 from diffabs.engine.drive.sharding import describe_placement, run_on_all_cores, run_on_auto_mesh
+from diffabs.engine.hybrid import Objectives
 from diffabs.engine.solvers import Solver
 from diffabs.loop.admissible import batch_admissibility, find_impossible_values, find_unstable_step
 from diffabs.loop.arguments import forbid_derivatives, prepare_arguments, refuse, refuse_unnamed
@@ -114,7 +115,9 @@ def run_batch(
         check_process()
 
     # Everything that may lie on devices is an argument, so that `run_on_auto_mesh` sees it.
-    def run(loop: Loop, values: PyTree, keys: Key, objectives: Any, accepted: Bool, enough: Any) -> Run:
+    def run(
+        loop: Loop, values: Params, keys: Key, objectives: Objectives, accepted: Bool, enough: EarlyEnd | None
+    ) -> Run:
         lanes = dataclasses.replace(batch, values=values, keys=keys)
         return _dispatch_batch(loop, lanes, solver, objectives, trajectories, together, accepted, enough, engine)
 

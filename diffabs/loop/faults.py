@@ -1,10 +1,12 @@
 """Why a run diverged."""
 
 import enum
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from diffabs.core.types import PyTree
+if TYPE_CHECKING:
+    from diffabs.loop.result import Run
 
 
 class Fault(enum.IntEnum):
@@ -41,7 +43,7 @@ FAULT_TEXTS = {
 }
 
 
-def describe_faults(run: PyTree) -> str:
+def describe_faults(run: "Run") -> str:
     """Return why a run diverged, or for a batch each reason with its number of runs; "" for none."""
     if run.fault is None:
         return ""

@@ -3,7 +3,6 @@
 import pathlib
 import re
 from collections.abc import Mapping
-from typing import Any
 
 from diffabs.core.protocols import Plant
 from diffabs.core.types import PyTree
@@ -18,7 +17,7 @@ KEYWORDS = set(KEYWORDS_TEXT.split())
 MAX_NAME = 60  # MATLAB reads 63 characters; a number against equal names takes the others
 
 
-def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
+def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: object) -> None:
     """Write the trajectory of one run, up to its end, to a MAT file, with `more` variables by name.
 
     The file has a column vector for each of the `signal_columns`. The struct `units` has their units, and the struct

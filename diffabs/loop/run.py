@@ -136,7 +136,7 @@ def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, 
 
 
 def run_unchecked(
-    loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: PyTree, every: int, engine: str = "auto"
+    loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: Key | None, every: int, engine: str = "auto"
 ) -> Run:
     """Return a run without a check of the parameters' values.
 

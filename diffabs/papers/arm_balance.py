@@ -99,7 +99,7 @@ def upright_model(plant: Part) -> StateSpace:
     return BalanceModel(plant=plant).matrices()
 
 
-def lqr_gain(plant: Part, weights: PyTree = (1.0,) * 6, effort: float = 1.0) -> np.ndarray:
+def lqr_gain(plant: Part, weights: Sequence[float] = (1.0,) * 6, effort: float = 1.0) -> np.ndarray:
     """Return the LQR gain K of u = K x about the upright position, shape (6,).
 
     Args:

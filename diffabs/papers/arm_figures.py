@@ -9,6 +9,7 @@ from diffabs.core.types import JsonObject, PyTree
 from diffabs.linear.recoverable import mode_bounds
 from diffabs.loop.result import Run
 from diffabs.output import plot
+from diffabs.output.plot.style import Sheet
 from diffabs.robust.design.attraction import Basin, Reach
 
 
@@ -39,7 +40,7 @@ def figures(
     }
 
 
-def _claim(runs: Mapping[str, Run]) -> Any:
+def _claim(runs: Mapping[str, Run]) -> Sheet:
     figure, axes = plot.sheet(1, 3, title="The same start, the same kind of LQR", size=(4.6, 3.4))
     titles = {
         "printed": "the paper's printed equations (its Fig. 3)",
@@ -55,7 +56,7 @@ def _claim(runs: Mapping[str, Run]) -> Any:
     return figure
 
 
-def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Any:
+def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Sheet:
     figure, axes = plot.sheet(
         1, len(basins), title="Hanging arm at 48 V: which starts are recovered", size=(5.0, 4.4), sharey=True
     )
@@ -85,7 +86,7 @@ def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Any:
     return figure
 
 
-def _riders(riders: np.ndarray, over_riders: Mapping[str, tuple[PyTree, list[Reach]]], limit: np.ndarray) -> Any:
+def _riders(riders: np.ndarray, over_riders: Mapping[str, tuple[PyTree, list[Reach]]], limit: np.ndarray) -> Sheet:
     figure, (ax,) = plot.sheet(title="One gain for every rider, hanging arm, 48 V", size=(6.6, 4.0))
     ax.plot(riders, limit, color="black", linewidth=1.2, label="no control beyond (linear)")
     for i, (name, (_, reaches)) in enumerate(over_riders.items()):

@@ -29,6 +29,7 @@ from diffabs.loop.closed_loop import Loop
 from diffabs.loop.result import Run
 from diffabs.loop.run import run_unchecked
 from diffabs.output import plot
+from diffabs.output.plot.style import Sheet
 from diffabs.papers import record
 from diffabs.papers.digest import Digest
 from diffabs.parts.plants import GRAVITY, RoadVehicle
@@ -346,7 +347,7 @@ def scenario_parameters(name: str) -> JsonObject:
 # Figure and digest
 
 
-def draw_rows(rows: list[JsonObject]) -> Any:
+def draw_rows(rows: list[JsonObject]) -> Sheet:
     """Return the figure of all stops: the printed number and ours, each as a multiple of the bound."""
     stops = [row for row in rows if row["bound"] and row["printed"] and row["unit"] in ("s", "m")]
     places = np.arange(len(stops))[::-1]

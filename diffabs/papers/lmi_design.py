@@ -14,6 +14,7 @@ from diffabs.core.types import JsonObject
 from diffabs.linear.slip_model import SlipModel
 from diffabs.loop.result import Run
 from diffabs.output import plot
+from diffabs.output.plot.style import Sheet
 from diffabs.papers import record
 from diffabs.papers.digest import Refuted
 from diffabs.parts.plants import MirroredRig
@@ -239,7 +240,7 @@ def figures(designed: Designed, braked: Mapping[str, Run]) -> JsonObject:
     }
 
 
-def _poles(loci: Mapping[str, np.ndarray], speeds: np.ndarray) -> Any:
+def _poles(loci: Mapping[str, np.ndarray], speeds: np.ndarray) -> Sheet:
     figure, axes = plot.sheet(
         1, len(loci), title="Poles of the frozen loop, 50 to 5 km/h", size=(4.6, 3.6), sharex=True, sharey=True
     )
@@ -254,7 +255,7 @@ def _poles(loci: Mapping[str, np.ndarray], speeds: np.ndarray) -> Any:
     return figure
 
 
-def _draw_damping(loci: Mapping[str, np.ndarray], speeds: np.ndarray) -> Any:
+def _draw_damping(loci: Mapping[str, np.ndarray], speeds: np.ndarray) -> Sheet:
     figure, (ax,) = plot.sheet(title="Damping of the frozen loop", size=(6.4, 3.8))
     for i, (name, poles) in enumerate(loci.items()):
         damping = np.min(-np.real(poles) / np.abs(poles), axis=1)

@@ -27,7 +27,7 @@ def lane(run: Run, i: int) -> Run:
 
 
 def computed_row(
-    name: str, quantity: str, unit: str, ours: Any, *, published: float | None = None, reference: Any = None
+    name: str, quantity: str, unit: str, ours: Any, *, published: float | None = None, reference: object = None
 ) -> JsonObject:
     """Return a row of a table with our number and, if known, the paper's or an independent number.
 
@@ -55,7 +55,7 @@ def format_time(time: Scalar) -> float | str:
     return "never" if math.isinf(float(time)) else float(time)
 
 
-def solver_settings(step: FixedStep, **more: Any) -> JsonObject:
+def solver_settings(step: FixedStep, **more: object) -> JsonObject:
     """Return the settings of the integration for a summary."""
     dtype = str(jnp.result_type(float))
     return {"method": "RK4, fixed step", "step": step.step, "duration": step.duration, "dtype": dtype, **more}

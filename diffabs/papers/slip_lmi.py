@@ -9,7 +9,6 @@ import dataclasses
 import math
 import pathlib
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import jax
 import numpy as np
@@ -23,6 +22,7 @@ from diffabs.loop.ensemble import run_batch
 from diffabs.loop.result import Run, Trajectory
 from diffabs.loop.run import rollout
 from diffabs.output import plot
+from diffabs.output.plot.style import Sheet
 from diffabs.papers import lmi_claims, lmi_design, record
 from diffabs.papers.digest import Digest, digest
 from diffabs.parts.controllers import HoldingInput, StateFeedback
@@ -294,7 +294,7 @@ def _design_section(runs: Mapping[str, Run], filtered: Run) -> tuple[list[JsonOb
     return lmi_design.table(designed, runs), lmi_design.figures(designed, shown), more
 
 
-def _torque_limits(runs: Mapping[str, Trajectory]) -> Any:
+def _torque_limits(runs: Mapping[str, Trajectory]) -> Sheet:
     figure, (top, bottom) = plot.sheet(2, 1, title="What torque limits do: windup", size=(6.8, 2.7), sharex=True)
     plot.draw_slip_lines(top, runs)
     plot.label_axes(top, "", "slip [1]")

@@ -96,7 +96,7 @@ def exported_parts(module: ModuleType) -> Iterator[tuple[str, PyTree]]:
         cls = item if isinstance(item, type) else type(item)
         if not dataclasses.is_dataclass(cls):
             continue
-        fields: Any = dataclasses.fields(cls)
+        fields: tuple[dataclasses.Field[Any], ...] = dataclasses.fields(cls)
         if not all({"spec", "part", "static"} & {*field.metadata} for field in fields):
             continue
         if not (isinstance(item, type) and cls.__module__.partition(".")[0] == "diffabs"):

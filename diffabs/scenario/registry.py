@@ -325,7 +325,7 @@ def _whole_range(field: dataclasses.Field[Any], value: Scalar) -> tuple[int, int
     return (1 if default >= 1 else -MAX_STATIC), MAX_STATIC
 
 
-def _numbers(value: object, depth: int, spec: ParameterSpec, path: str) -> Any:
+def _numbers(value: object, depth: int, spec: ParameterSpec, path: str) -> float | np.ndarray:
     """Return a number (`depth` 0), or the array of lists that are nested `depth` deep."""
     if not depth:
         return read_number(value, spec, path)

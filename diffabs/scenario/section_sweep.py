@@ -63,6 +63,7 @@ from diffabs.uncertainty.sweep import distributions, sampling
 from diffabs.uncertainty.sweep.variables import Correlation, Space, read_correlation
 
 if TYPE_CHECKING:
+    from diffabs.scenario.scenario import Scenario
     from diffabs.uncertainty.sweep import Study
 
 DEFAULT_SAMPLES = 1000  # for a sampling design without a number of points of its own
@@ -119,7 +120,7 @@ class SweepSection:
         return plain_fields(dataclasses.replace(self, over={}, correlation=None)) | short
 
 
-def _format_item(item: object) -> PyTree:
+def _format_item(item: object) -> JsonObject:
     """Return a distribution, or a choice of parts, as a TOML value."""
     if isinstance(item, distributions.Uniform):
         return interval_table(item.low, item.high)
@@ -245,7 +246,7 @@ def read_failure(text: str, scenario: Any) -> tuple[str, float]:
     return metric, scenario.sweep.failures[metric]
 
 
-def build_study(scenario: Any) -> "Study":
+def build_study(scenario: "Scenario") -> "Study":
     """Return the sweep of a scenario."""
     from diffabs.uncertainty.sweep import Study
 

@@ -8,9 +8,10 @@ import numpy as np
 
 from diffabs.core.bijectors import reached_bound
 from diffabs.core.pytree import get, parameters
-from diffabs.core.types import JsonObject, Params, Part, Scalar
+from diffabs.core.types import JsonObject, Params, Scalar
 from diffabs.host.values import ScenarioError
 from diffabs.loop.admissible import first_refusal
+from diffabs.loop.closed_loop import Loop
 from diffabs.scenario import proving
 from diffabs.scenario.proving import Proved
 from diffabs.scenario.scenario import Scenario
@@ -156,7 +157,7 @@ def _constraint_row(name: str, bound: float, before: float | None, after: float 
     return {**row, "met": beyond <= 0, "missed": missed}
 
 
-def _least_damping(task: "ProofTask", loop: Part) -> float:
+def _least_damping(task: "ProofTask", loop: Loop) -> float:
     """Return the least damping of the poles over the vertices."""
     from diffabs.tune import Poles
 

@@ -22,7 +22,7 @@ MIN_POLE_MAGNITUDE = 1e-9  # |z| below which a discrete pole decays within one p
 class Constraint(Protocol):
     """A requirement on a loop and on the metrics of its runs."""
 
-    def excess(self, loop: Loop, metrics: Params) -> PyTree:
+    def excess(self, loop: Loop, metrics: Params) -> Scalar:
         """Return the excesses (k,) of `loop`, <= 0 where the constraint holds; each of `metrics` has shape (runs,)."""
         ...
 
@@ -39,7 +39,7 @@ class AtMost:
     metric: str
     bound: Scalar
 
-    def excess(self, loop: Loop, metrics: Params) -> PyTree:
+    def excess(self, loop: Loop, metrics: Params) -> Scalar:
         """Return (metric - bound)/|bound|, shape (runs,); for a zero bound the metric itself.
 
         The metric is an entry of `metrics`; `loop` is not used.
@@ -69,7 +69,7 @@ class Poles:
     decay: float = 0.0
     damping: float = 0.0
 
-    def excess(self, loop: Loop, metrics: Params) -> PyTree:
+    def excess(self, loop: Loop, metrics: Params) -> Scalar:
         """Return the excesses of each vertex and pole of `loop`, shape (k,); `metrics` is not used.
 
         First come (decay + Re s)/|decay|, or Re s without a decay rate. If a damping ratio is given, damping + Re s/|s|
@@ -80,7 +80,7 @@ class Poles:
         rates = (self.decay + real) / (abs(self.decay) or 1.0)
         return jnp.concatenate([rates.ravel(), (self.damping - ratios).ravel() if self.damping else jnp.zeros(0)])
 
-    def least_damping(self, loop: Loop) -> PyTree:
+    def least_damping(self, loop: Loop) -> Scalar:
         """Return the least damping ratio -Re s/|s| of `loop` over the poles s of all vertices."""
         return jnp.min(self._modes(loop)[1])
 
@@ -113,7 +113,7 @@ class CertifiedDecay:
     system: Polytope
     decay: float
 
-    def excess(self, loop: Loop, metrics: Params) -> PyTree:
+    def excess(self, loop: Loop, metrics: Params) -> Scalar:
         """Return (decay - proved decay)/max(|decay|, 1) of `loop`, shape (1,); `metrics` is not used."""
         del metrics
         system = self.system

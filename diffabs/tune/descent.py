@@ -13,7 +13,7 @@ step independently.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +21,13 @@ import numpy as np
 import optax
 
 from diffabs.core.reason import Reason
-from diffabs.core.types import Matrix, PyTree, Scalar, Vector
+from diffabs.core.types import Array, Matrix, PyTree, Scalar, Vector
 from diffabs.tune.method import Stopping
 from diffabs.tune.problem import LossEvaluation, Multipliers
 from diffabs.tune.result import DescentPoint
+
+T = TypeVar("T")
+
 
 ARMIJO_FRACTION, WOLFE_FRACTION = 1e-4, 0.9
 MIN_STEP_FACTOR = 1e-10  # least t of a line search
@@ -185,7 +188,7 @@ class Descent:
         self.searches: bool = optimiser.searches
         self._init = jax.jit(jax.vmap(optimiser.transformation.init))
 
-        def update(g: Matrix, state: object, z: Matrix, value: Scalar, m: Scalar) -> Any:
+        def update(g: Matrix, state: object, z: Matrix, value: Scalar, m: Scalar) -> tuple[PyTree, PyTree]:
             more = {"value": value, "grad": g, "value_fn": lambda z: loss(z, m)}
             return optimiser.transformation.update(g, state, z, **more)
 
@@ -367,11 +370,11 @@ def _is_descent_direction(update: np.ndarray, gradient: Vector) -> bool:
     return bool(np.isfinite(size) and update @ gradient < -1e-10 * size)
 
 
-def _select_by_start(mask: np.ndarray, a: Scalar, b: Scalar) -> PyTree:
+def _select_by_start(mask: np.ndarray, a: Scalar, b: Scalar) -> Array:
     """Return the leaves of `a` for the starts in `mask` and the leaves of `b` for the others."""
     return jax.tree.map(lambda x, y: jnp.where(mask.reshape(-1, *[1] * (jnp.ndim(x) - 1)), x, y), a, b)
 
 
-def slice_start(tree: object, i: int) -> PyTree:
+def slice_start(tree: T, i: int) -> T:
     """Return the tree of one start: entry `i` along the leading axis of each leaf."""
     return jax.tree.map(lambda x: x[i], tree)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.pytree import replace, stack_lists
-from diffabs.core.types import Params, Part, PyTree
+from diffabs.core.types import Array, Params, Part, PyTree
 from diffabs.engine.solvers import FixedStep, Solver
 from diffabs.loop.batch import Batch
 from diffabs.loop.closed_loop import Loop
@@ -59,7 +59,7 @@ def warn(subject: object, values: Params, batch: Batch, solver: Solver, where: s
     run.
     """
 
-    def compare(values: Params) -> PyTree:
+    def compare(values: Params) -> Array:
         """Return both numbers of each pair in each run, shape (2, runs, pairs)."""
         loop = stack_lists(build_subject_loop(replace(subject, values)))
         both = batch.each(loop, lambda loop, _: [jnp.stack(two) for _, *two in one_sided_candidates(loop, solver)])

@@ -45,7 +45,7 @@ class ObjectiveEvaluation(NamedTuple):
     """
 
     objective: Any
-    excess: Any
+    excess: Array
     diverged: Bool
     metrics: dict[str, PyTree]
     slid: Int = 0
@@ -146,7 +146,7 @@ class Problem:
             lambda metrics: self._excess(build_subject_loop(self.space.at(self.subject, z)), metrics), lanes
         ).size
 
-    def _excess(self, loop: Loop, metrics: dict[str, PyTree]) -> Any:
+    def _excess(self, loop: Loop, metrics: dict[str, PyTree]) -> Array:
         excess = [jnp.ravel(c.excess(loop, metrics)) for c in self.constraints]
         return jnp.concatenate(excess) if excess else jnp.zeros(0)
 

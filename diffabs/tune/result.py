@@ -134,7 +134,7 @@ class Tuned:
         return self.table()._repr_html_()
 
     @property
-    def loop(self) -> PyTree:
+    def loop(self) -> Loop:
         """Tuned closed loop."""
         return build_subject_loop(self.part)
 

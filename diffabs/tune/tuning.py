@@ -11,7 +11,7 @@ from diffabs.core.kinds import find_value_objection, format_value, value_shape
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, get, replace
 from diffabs.core.tracing import used_inputs
-from diffabs.core.types import Params, PyTree
+from diffabs.core.types import Params
 from diffabs.core.validity import check_part
 from diffabs.engine.drive.engine import resolve_request
 from diffabs.engine.solvers import Solver
@@ -229,7 +229,7 @@ def _check_constraints(
 def _check_not_overwritten(subject: object, space: FreeSpace, batch: Batch) -> None:
     """Raise a ValueError if `over` or `closed_loop()` overwrites a free parameter: the search could not move it."""
 
-    def loops(values: Params) -> PyTree:
+    def loops(values: Params) -> Loop:
         loop = canonical_dtypes(build_subject_loop(replace(subject, values)))
         return batch.each(loop, lambda loop, key: loop)
 

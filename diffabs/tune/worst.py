@@ -18,7 +18,6 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +30,7 @@ from diffabs.core.kinds import format_value
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters, replace
 from diffabs.core.reason import Reason
-from diffabs.core.types import Part, PyTree
+from diffabs.core.types import PyTree, Vector
 from diffabs.core.units import units_of
 from diffabs.core.validity import check_part
 from diffabs.engine.drive.engine import describe_engine
@@ -83,7 +82,7 @@ class WorstCase:
     corner: float
     screened: float
     metrics: dict[str, float]
-    loop: Part
+    loop: Loop
     rollouts: float
     bound: float | None
     diverged: dict[str, PyTree] | None
@@ -135,7 +134,7 @@ class WorstCase:
 
 @default_flags()
 def worst_case(
-    loop: Part,
+    loop: Loop,
     *,
     over: Mapping[str, Range],
     metric: str,
@@ -302,7 +301,7 @@ def _draw_points(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
     return low + (high - low) * sequence.random_base2(max(screen - 1, 0).bit_length())[:screen]
 
 
-def _values_by_path(free: FreeSpace, point: Any) -> dict[str, PyTree]:
+def _values_by_path(free: FreeSpace, point: Vector) -> dict[str, PyTree]:
     """Return the parameters by path from a vector (p,), or from the rows of a matrix (runs, p)."""
     values, first = {}, 0
     for entry in free.entries:

@@ -133,7 +133,7 @@ def map_entries(function: Callable[..., Node], *arrays: PyTree) -> NodeArray:
     return out
 
 
-def inline_program(graph: Graph, program: Any, inputs: Sequence[NodeArray]) -> list[NodeArray]:
+def inline_program(graph: Graph, program: jex.ClosedJaxpr, inputs: Sequence[NodeArray]) -> list[NodeArray]:
     """Lower a program (jaxpr, closed or not) that another one calls, and return its outputs as arrays of nodes."""
     jaxpr, constants = (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, ())
     return lower_jaxpr(graph, jaxpr, [constant_array(graph, x) for x in constants], inputs)

@@ -64,7 +64,7 @@ def call_kernel(
     return buffer_callback(start, whole)(*arguments)[:-1]
 
 
-def _pack_addresses(addresses: list[int], sizes: list[int]) -> PyTree:
+def _pack_addresses(addresses: list[int], sizes: list[int]) -> ctypes.Array[ctypes.c_void_p]:
     """Return the struct `Arrays` of `threads.h`: groups of `sizes` addresses, each with one null pointer at its end."""
     remaining, pointers = iter(addresses), []
     for size in sizes:
@@ -176,7 +176,7 @@ def _launch(kernel: object, blocks: int, threads: int, stream: int, *args: PyTre
     _call_driver("cuLaunchKernel", kernel, blocks, 1, 1, threads, 1, 1, 0, ctypes.c_void_p(stream), pointers, nothing)
 
 
-def _call_driver(name: str, *args: PyTree) -> None:
+def _call_driver(name: str, *args: object) -> None:
     """Call a function of the driver; raise RuntimeError with the name of the error it returns."""
     if failed := getattr(_load_driver(), name)(*args):
         message = ctypes.c_char_p()
@@ -185,7 +185,7 @@ def _call_driver(name: str, *args: PyTree) -> None:
 
 
 @functools.cache
-def _load_driver() -> Any:
+def _load_driver() -> ctypes.CDLL:
     driver = ctypes.CDLL("libcuda.so.1")
     driver.cuInit(0)
     return driver

@@ -22,7 +22,7 @@ from jax.interpreters import partial_eval as pe
 
 from diffabs.compiler.autodiff.jvp import ArrayKey, arrange_arrays
 from diffabs.compiler.ir import UpdateLevel, is_real
-from diffabs.compiler.lane_programs import LanePrograms
+from diffabs.compiler.lane_programs import LanePrograms, Seeds
 from diffabs.core.types import Array, PyTree, Scalar
 
 MAX_TANGENTS_PER_LAUNCH = 8  # directions; more take several launches
@@ -44,13 +44,13 @@ def bind_lanes(lanes: LanePrograms, arrays: Sequence[PyTree]) -> list[PyTree]:
 
 
 @run_lanes_primitive.def_impl
-def _run(*arrays: PyTree, **how: Any) -> list[PyTree]:
+def _run(*arrays: Array, **how: Any) -> list[PyTree]:
     # The primitive has a lowering but no eager evaluation, so a call outside jit compiles as well.
     return jax.jit(functools.partial(run_lanes_primitive.bind, **how))(*arrays)
 
 
 @run_lanes_primitive.def_abstract_eval
-def _shapes(*arrays: PyTree, lanes: LanePrograms, seeds: object, many: int, as_lanes: frozenset[int]) -> list[PyTree]:
+def _shapes(*arrays: PyTree, lanes: LanePrograms, seeds: Seeds, many: int, as_lanes: frozenset[int]) -> list[PyTree]:
     """Return the shapes and types of the results: (lanes, ...) of values, (lanes, many, ...) of tangents."""
     carry = arrays[len(lanes.value_keys) - len(lanes.functions.types[UpdateLevel.STEP]) : len(lanes.value_keys)]
 
@@ -63,7 +63,7 @@ def _shapes(*arrays: PyTree, lanes: LanePrograms, seeds: object, many: int, as_l
 
 
 def _launch_in_parts(
-    *arrays: PyTree, lanes: LanePrograms, seeds: object, many: int, as_lanes: frozenset[int]
+    *arrays: Array, lanes: LanePrograms, seeds: Seeds, many: int, as_lanes: frozenset[int]
 ) -> list[PyTree]:
     """Return the primitive's results from as few launches as MAX_TANGENTS_PER_LAUNCH allows.
 
@@ -80,7 +80,7 @@ def _launch_in_parts(
     def part(first: int) -> list[PyTree]:
         """Return the results of the launch for `each` directions from `first` on."""
 
-        def cut(key: ArrayKey, x: Array) -> PyTree:
+        def cut(key: ArrayKey, x: Array) -> Array:
             # Tangents of arrays of lanes are (lanes, tangents, ...), of uniform arrays (tangents, ...).
             axis = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
             lacking = max(0, first + each - many)
@@ -111,7 +111,7 @@ def build_launches(program: Any) -> None:
 
 
 def _launch_once(
-    lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: frozenset[int], arrays_by_key: dict[ArrayKey, PyTree]
+    lanes: LanePrograms, seeds: Seeds, many: int, as_lanes: frozenset[int], arrays_by_key: dict[ArrayKey, PyTree]
 ) -> list[PyTree]:
     """Return the results of one launch; initial tangents of the carry that are not in `arrays_by_key` are zero."""
 
@@ -128,8 +128,14 @@ def _launch_once(
 
 
 def _jvp_rule(
-    arrays: Sequence[PyTree], slopes: Sequence[PyTree], *, lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: Any
-) -> PyTree:
+    arrays: Sequence[PyTree],
+    slopes: Sequence[PyTree],
+    *,
+    lanes: LanePrograms,
+    seeds: Seeds,
+    many: int,
+    as_lanes: frozenset[int],
+) -> tuple[list[PyTree], list[PyTree]]:
     if seeds is not None:
         raise ValueError("a kernel has no second derivatives; engine = 'xla' has")
     # Integers and truths have tangents of type float0 in JAX. They carry no derivative.
@@ -142,7 +148,7 @@ def _jvp_rule(
     # Build the derivative here: JAX 0.12 forbids tracing inside the abstract evaluation, where `result_keys` needs it.
     lanes.derivative(seeds)
 
-    def add_direction_axis(key: ArrayKey, x: Scalar) -> PyTree:
+    def add_direction_axis(key: ArrayKey, x: Scalar) -> Array:
         return jnp.expand_dims(x, 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1)
 
     seed_tangents = [
@@ -159,13 +165,19 @@ def _jvp_rule(
 ad.primitive_jvps[run_lanes_primitive] = _jvp_rule
 
 
-def _zero_tangent(x: Scalar) -> PyTree:
+def _zero_tangent(x: Scalar) -> ad.Zero:
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
 def _batching_rule(
-    arrays: Sequence[PyTree], axes: Sequence[PyTree], *, lanes: LanePrograms, seeds: PyTree, many: int, as_lanes: Any
-) -> PyTree:
+    arrays: Sequence[PyTree],
+    axes: Sequence[PyTree],
+    *,
+    lanes: LanePrograms,
+    seeds: Seeds,
+    many: int,
+    as_lanes: frozenset[int],
+) -> tuple[list[Array], Sequence[int | None]]:
     """Return the results for a batch, and their batch axes.
 
     The batch axis is merged into the axis of directions if only tangents are batched, else into the axis of lanes.
@@ -213,13 +225,13 @@ def _batching_rule(
 batching.primitive_batchers[run_lanes_primitive] = _batching_rule
 
 
-def _refuse_partial_evaluation(trace: object, *tracers: Any, **how: Any) -> NoReturn:
+def _refuse_partial_evaluation(trace: object, *tracers: object, **how: object) -> NoReturn:
     """Raise ValueError: JAX linearizes the kernel (`jax.grad`, `jax.linearize`), and no reverse mode exists."""
     del trace, tracers, how
     raise ValueError(NO_REVERSE_MODE)
 
 
-def _refuse_transpose(*args: PyTree, **how: Any) -> NoReturn:
+def _refuse_transpose(*args: object, **how: object) -> NoReturn:
     """Raise ValueError: JAX transposes the kernel, and no reverse mode exists."""
     del args, how
     raise ValueError(NO_REVERSE_MODE)

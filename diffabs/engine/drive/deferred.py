@@ -38,7 +38,7 @@ from jax.interpreters import partial_eval as pe
 from jax.sharding import NamedSharding, PartitionSpec
 
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.types import PyTree
+from diffabs.core.types import Array, PyTree
 from diffabs.engine.drive.engine import EngineError, check_process, describe_engine, is_forked
 from diffabs.engine.hybrid import Finish
 from diffabs.host.process import default_platform
@@ -74,11 +74,11 @@ class DeferredRun(NamedTuple):
     by_xla: Callable[[Any, PyTree], PyTree]
     required: bool
 
-    def call_xla(self, *leaves: PyTree) -> list[PyTree]:
+    def call_xla(self, *leaves: Array) -> list[PyTree]:
         """Return the leaves of the run by XLA."""
         return jax.tree.leaves(self.by_xla(self.capacity, _rebuild(self.structure, self.key_kinds, leaves)))
 
-    def call_kernel(self, *leaves: PyTree) -> list[PyTree]:
+    def call_kernel(self, *leaves: Array) -> list[PyTree]:
         """Return the leaves of the run by a kernel; `Unsupported` or `NoCompiler` if that is impossible."""
         from diffabs.engine.drive.kernel import run_single  # `import diffabs` must not need the compiler
 
@@ -107,7 +107,7 @@ def run_deferred(by_xla: Callable[[Any, PyTree], PyTree], capacity: Any, run: Py
 def _result_shape(structure: object, kinds: tuple[Any, ...], finish: Finish, leaves: tuple[Any, ...]) -> PyTree:
     """Return the result of one run as shapes: that of a run which is over before its first step."""
 
-    def finish_at_start(*leaves: PyTree) -> PyTree:
+    def finish_at_start(*leaves: Array) -> PyTree:
         hybrid, objectives, method, key = _rebuild(structure, kinds, leaves)
         hybrid, further = hybrid.prepare_run()
         objectives = {**objectives, **further}
@@ -185,7 +185,7 @@ class _Call(NamedTuple):
     def vectorize(self, run: Function) -> Function:
         """Return `run`, a function of the leaves of one run, as a function of the arguments of the primitive."""
 
-        def derivative(*arrays: PyTree) -> tuple[list[PyTree], list[PyTree]]:
+        def derivative(*arrays: Array) -> tuple[list[PyTree], list[PyTree]]:
             leaves, tangents = arrays[: self.leaf_count], arrays[self.leaf_count :]
             if self.tangent_leaves is None:
                 return run(*leaves), []
@@ -197,7 +197,7 @@ class _Call(NamedTuple):
             axes = tuple(0 if mapped else None for mapped in level)
             function = jax.vmap(function, in_axes=axes, out_axes=(0 if self.has_own_runs(level) else None, 0))
 
-        def flat(*arrays: PyTree) -> list[PyTree]:
+        def flat(*arrays: Array) -> list[PyTree]:
             values, rates = function(*arrays)
             return [*values, *rates]
 
@@ -267,7 +267,9 @@ def _replace_leaves(leaves: Leaves, places: Sequence[int], new: Leaves) -> list[
 
 
 @functools.lru_cache(MAX_KEPT_PROGRAMS)
-def _trace_kernel(call: _Call, arguments: tuple[jax.ShapeDtypeStruct, ...], platform: str, compiler: str | None) -> Any:
+def _trace_kernel(
+    call: _Call, arguments: tuple[jax.ShapeDtypeStruct, ...], platform: str, compiler: str | None
+) -> str | jex.ClosedJaxpr:
     """Return the call by a kernel as a closed jaxpr whose kernels are built, or one line on why that is impossible."""
     del platform, compiler  # parts of the key: on another device, or with another compiler, the answer may differ
     from diffabs.compiler.lower.rules import Unsupported
@@ -310,7 +312,7 @@ def _log_choice(subject: str, objection: str) -> None:
     log.info("%s: %s", subject, engine)
 
 
-def find_kernels(program: Any) -> list[tuple[Any, str]]:
+def find_kernels(program: jex.ClosedJaxpr) -> list[tuple[Any, str]]:
     """Return for each run of a traced program its kernel's closed jaxpr and "", or None and the reason for XLA.
 
     The kernels are built. A reverse mode by XLA has no run left in its program.
@@ -321,7 +323,7 @@ def find_kernels(program: Any) -> list[tuple[Any, str]]:
     ]
 
 
-def _run_equations(jaxpr: Any) -> Iterator[Any]:
+def _run_equations(jaxpr: jex.Jaxpr) -> Iterator[Any]:
     for equation in jaxpr.eqns:
         if equation.primitive in (run_primitive, derivative_primitive):
             yield equation
@@ -364,7 +366,7 @@ def _compile_call(call: _Call) -> Callable[..., list[PyTree]]:
 
 
 @default_flags()
-def _evaluate(*arrays: PyTree, **named: Any) -> list[PyTree]:
+def _evaluate(*arrays: Array, **named: Any) -> list[PyTree]:
     """Return the results of an eager call, compiled; under `jax.disable_jit` by XLA's single operations."""
     call = _Call(**named)
     without_jit = jax.config.jax_disable_jit  # pyright: ignore
@@ -532,13 +534,13 @@ def _multiply(call: _Call, jacobian: list[PyTree], tangents: Leaves) -> list[PyT
 
 
 @default_flags()
-def _transpose(cotangents: Sequence[PyTree], *arguments: PyTree, **named: Any) -> list[PyTree]:
+def _transpose(cotangents: Sequence[PyTree], *arguments: Array, **named: Any) -> list[PyTree]:
     """Return the cotangents of the tangents of a `run_derivative` that JAX has staged as it is."""
     call = _Call(**named)
     unknown = [i for i, x in enumerate(arguments) if ad.is_undefined_primal(x)]
     types = [jax.ShapeDtypeStruct(arguments[i].aval.shape, arguments[i].aval.dtype) for i in unknown]
 
-    def rates(*tangents: PyTree) -> list[PyTree]:
+    def rates(*tangents: Array) -> list[PyTree]:
         return call.split(call.vectorize(call.deferred.call_xla)(*_replace_leaves(arguments, unknown, tangents)))[1]
 
     _, cotangents = call.split(cotangents)

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import jax
 from jax._src.xla_bridge import backends_are_initialized  # JAX has no public function that does not start the backends
 
-from diffabs.core.types import PyTree
 from diffabs.host.process import default_platform
 
 T = TypeVar("T")
@@ -73,7 +72,7 @@ def default_engine() -> str:
     return "xla" if resolve_request("auto") == "xla" else "auto"
 
 
-def _describe_structure(data: PyTree) -> Hashable:
+def _describe_structure(data: object) -> Hashable:
     """Return what decides whether a kernel is possible: structure and shapes of the data, platform, asked compiler."""
     from diffabs.compiler.runtime.toolchain import COMPILER
 

@@ -24,7 +24,7 @@ from diffabs.core.types import Bool, Key, Params, PyTree, Scalar, Vector
 from diffabs.engine.drive.engine import check_process
 from diffabs.engine.drive.loops import STEPS_PER_BLOCK
 from diffabs.engine.drive.packed import STEPS_PER_EXCHANGE, EarlyEnd, sample_now, split_by_lane
-from diffabs.engine.hybrid import Finish, HybridSystem, Objectives
+from diffabs.engine.hybrid import Finish, HybridState, HybridSystem, Objectives
 from diffabs.engine.step.adaptive import AdaptiveStepping
 from diffabs.engine.step.replay import LaggedReplay, LaggedReplayStepping, refuse_derivative
 from diffabs.engine.step.status import RunStatus
@@ -35,7 +35,7 @@ MAX_LANES_PER_LAUNCH = 1 << 17  # runs that are started together: the carries of
 def run_native(
     hybrid: HybridSystem,
     values: Params,
-    keys: PyTree,
+    keys: Key | None,
     method: PyTree,
     objectives: Objectives,
     accepted: Vector,
@@ -51,7 +51,7 @@ def run_native(
     early_data = None if enough is None else jax.vmap(enough.data_of)(jnp.arange(count))
     lanes = values, keys, accepted, early_data
 
-    def run_launch(rows: PyTree) -> PyTree:
+    def run_launch(rows: tuple[PyTree, ...]) -> PyTree:
         """Return the runs of one launch; `rows` are theirs of `lanes`."""
         inputs = hybrid, rows[0], dict(objectives), method, *rows[1:], enough
         # A call through a derivative rule costs more than a short run.
@@ -80,12 +80,12 @@ def run_single(
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _run_differentiable(finish: Finish, arguments: PyTree) -> PyTree:
+def _run_differentiable(finish: Finish, arguments: tuple[PyTree, ...]) -> PyTree:
     """Return the runs of (system, values, objectives, method, keys, accepted, data for early ends, early ends)."""
     return _run(*arguments, finish=finish)
 
 
-def _rule(finish: Finish, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
+def _rule(finish: Finish, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
     """Return the runs and their tangents.
 
     Fixed steps are those of `FixedStepping.for_derivatives`. Adaptive steps are replayed one by one
@@ -96,7 +96,7 @@ def _rule(finish: Finish, primals: PyTree, tangents: PyTree) -> tuple[PyTree, Py
     refuse_derivative(given_system, measured, method)
     paths = differentiated_paths(moves[0]) | {path for path, move in moves[1].items() if type(move) is not SymbolicZero}
 
-    def run(arguments: PyTree) -> PyTree:
+    def run(arguments: tuple[PyTree, ...]) -> PyTree:
         # Only paths with a nonzero tangent are prepared for derivatives.
         hybrid, values, objectives, method, *lane_data = arguments
         hybrid = prepare_derivatives(hybrid, paths)
@@ -119,7 +119,7 @@ def _run(
     values: Params,
     objectives: Objectives,
     method: PyTree,
-    keys: PyTree,
+    keys: Key | None,
     accepted: Scalar,
     early_data: PyTree,
     enough: EarlyEnd | None,
@@ -129,10 +129,10 @@ def _run(
     """Return the results of all runs; `method` is the stepping method, `early_data` the runs' data for `enough`."""
     leaves, build_lane = split_by_lane(hybrid, values, objectives)
 
-    def start(lane_leaves: PyTree, key: PyTree, accepted: Scalar) -> PyTree:
+    def start(lane_leaves: PyTree, key: Key | None, accepted: Scalar) -> PyTree:
         return _stop_unaccepted(accepted, method.start(*build_lane(lane_leaves), key))
 
-    def is_running(lane: PyTree, carry: PyTree) -> Bool:
+    def is_running(lane: tuple[PyTree, ...], carry: PyTree) -> Bool:
         if enough is None:
             return carry.running
         sample = sample_now(build_lane(lane[0])[0], carry)
@@ -158,7 +158,7 @@ def _run(
     return jax.vmap(judge)(leaves, carry)
 
 
-def _check_logs(hybrid: HybridSystem, state: PyTree) -> None:
+def _check_logs(hybrid: HybridSystem, state: HybridState) -> None:
     """Raise Unsupported if a recorder keeps its past in more rows, shape (runs, rows, n), than a kernel can index."""
     for name in hybrid.recorders:
         for rows in log_rows(getattr(state, name)):

@@ -11,7 +11,7 @@ capacity.
 
 import math
 from collections.abc import Callable
-from typing import Any, TypeAlias, TypeVar
+from typing import Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,13 @@ from diffabs.core.types import Array, Bool, Int, PyTree
 
 X = TypeVar("X")
 
-MethodCarry: TypeAlias = Any  # pytree of the stepping method, with an attribute `running`
+
+class _Running(Protocol):
+    @property
+    def running(self) -> Array: ...
+
+
+MethodCarry = TypeVar("MethodCarry", bound=_Running)  # pytree of the stepping method
 # Function of a carry and, for trajectories, of `until`, the number of the grid instant at which to pause.
 Step = Callable[..., MethodCarry]
 SCAN_GROUP_STEPS = 32  # attempts that are skipped together
@@ -37,7 +43,7 @@ def round_up_capacity(count: int) -> int:
     return -(-count // unit) * unit
 
 
-def run_to_end(step: Step, renew: Step, carry: MethodCarry) -> MethodCarry:
+def run_to_end(step: Step[MethodCarry], renew: Step[MethodCarry], carry: MethodCarry) -> MethodCarry:
     """Return the carry at the end of a run, or of a batch under `jax.vmap`. Not for reverse mode.
 
     `renew` is called once before each block of `STEPS_PER_BLOCK` steps.
@@ -50,12 +56,12 @@ def run_to_end(step: Step, renew: Step, carry: MethodCarry) -> MethodCarry:
 
 
 def run_with_trajectory(
-    step: Step,
-    renew: Step,
+    step: Step[MethodCarry],
+    renew: Step[MethodCarry],
     before: Callable[[MethodCarry, PyTree], PyTree],
     look: Callable[[MethodCarry, PyTree], PyTree],
     carry: MethodCarry,
-    every: Any,
+    every: Int,
     count: Int,
     room: int,
 ) -> tuple[MethodCarry, PyTree]:
@@ -79,7 +85,7 @@ def run_with_trajectory(
 
 
 def scan_with_trajectory(
-    step: Step,
+    step: Step[MethodCarry],
     before: Callable[[MethodCarry, PyTree], PyTree],
     look: Callable[[MethodCarry, PyTree], PyTree],
     carry: MethodCarry,
@@ -108,7 +114,7 @@ def scan_with_trajectory(
 
 
 def scan_steps(
-    step: Step,
+    step: Step[MethodCarry],
     on: Callable[[MethodCarry, PyTree], PyTree],
     carry: MethodCarry,
     first: Int,
@@ -164,7 +170,11 @@ def repeat_step(step: Callable[[X], X], carry: X, capacity: int, on: Callable[[X
 
 
 def log_run(
-    step: Step, renew: Step, log: Callable[[MethodCarry, MethodCarry], PyTree], carry: MethodCarry, room: int
+    step: Step[MethodCarry],
+    renew: Step[MethodCarry],
+    log: Callable[[MethodCarry, MethodCarry], PyTree],
+    carry: MethodCarry,
+    room: int,
 ) -> tuple[MethodCarry, PyTree]:
     """Return the carry at the end of a run, and the entry log(before, after) of each attempt, at least `room` of them.
 

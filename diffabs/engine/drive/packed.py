@@ -15,7 +15,7 @@ from diffabs.core.first_order import first_order
 from diffabs.core.pytree import replace
 from diffabs.core.tracing import split_batched
 from diffabs.core.types import Array, Bool, Params, PyTree, Scalar, Vector
-from diffabs.engine.drive.loops import STEPS_PER_BLOCK, MethodCarry
+from diffabs.engine.drive.loops import STEPS_PER_BLOCK
 from diffabs.engine.hybrid import Finish, HybridSample, HybridSystem, Objectives
 from diffabs.engine.step.status import RunStatus
 
@@ -74,7 +74,7 @@ def split_by_lane(
     return leaves, build_lane
 
 
-def sample_now(hybrid: HybridSystem, carry: MethodCarry) -> HybridSample:
+def sample_now(hybrid: HybridSystem, carry: PyTree) -> HybridSample:
     """Return the sample of a run at its present point."""
     return hybrid.signals(carry.point.t, carry.point.state).sample
 
@@ -93,7 +93,7 @@ class _LaneSlots(NamedTuple):
 
     leaves: PyTree
     keys: PyTree
-    carry: MethodCarry
+    carry: PyTree
     number: Scalar
     next: Any
     ended: PyTree
@@ -121,7 +121,7 @@ def _run(
     start = jax.vmap(lambda lane_leaves, key: method.start(*build_lane(lane_leaves), key))
     finish_all = jax.vmap(lambda lane_leaves, carry: finish(*build_lane(lane_leaves), carry)[0])
 
-    def take_lanes(number: Scalar) -> tuple[PyTree, PyTree, MethodCarry]:
+    def take_lanes(number: Scalar) -> tuple[PyTree, PyTree, PyTree]:
         """Return leaves, keys and carries of these runs at t = 0; beyond the last run a copy that does not step."""
         lane_leaves, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
         carry = start(lane_leaves, key)
@@ -129,7 +129,7 @@ def _run(
         return lane_leaves, key, carry._replace(status=status.astype(carry.status.dtype))
 
     def step_and_exchange(slots: _LaneSlots) -> _LaneSlots:
-        def step_once(carry: MethodCarry, _: object) -> tuple[MethodCarry, None]:
+        def step_once(carry: PyTree, _: object) -> tuple[PyTree, None]:
             return step_all(slots.leaves, slots.keys, carry), None
 
         def renew_and_step(carry: object, _: object) -> tuple[PyTree, None]:
@@ -151,7 +151,7 @@ def _run(
 
 def _lanes_ended_early(
     enough: EarlyEnd | None, build_lane: Callable[[PyTree], PyTree], slots: _LaneSlots, numbers: Array
-) -> PyTree:
+) -> Bool:
     """Return True for each slot whose run ends early; `build_lane` returns the system and objectives of one run."""
     if enough is None:
         return jnp.zeros_like(slots.carry.running)
@@ -165,7 +165,7 @@ def _lanes_ended_early(
 def _exchange_lanes(
     slots: _LaneSlots,
     free: PyTree,
-    finish: Callable[[PyTree, MethodCarry], PyTree],
+    finish: Callable[[PyTree, PyTree], PyTree],
     take_lanes: Callable[[PyTree], PyTree],
     count: int,
 ) -> _LaneSlots:
@@ -180,7 +180,7 @@ def _exchange_lanes(
     return _LaneSlots(lane_leaves, key, carry, jnp.minimum(number, count), slots.next + jnp.sum(free), ended)
 
 
-def _select_lanes(free: Array, a: Array, b: Scalar) -> PyTree:
+def _select_lanes(free: Array, a: Array, b: Scalar) -> Array:
     if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(_select_lanes(free, jax.random.key_data(a), jax.random.key_data(b)))
     return jnp.where(free.reshape(-1, *[1] * (a.ndim - 1)), a, b)

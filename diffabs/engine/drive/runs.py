@@ -21,7 +21,7 @@ from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once, is_traced
 from diffabs.core.numerics import void_derivatives
 from diffabs.core.pytree import prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero
-from diffabs.core.types import Array, Key, PyTree, Scalar
+from diffabs.core.types import Array, Int, Key, PyTree, Scalar
 from diffabs.engine.drive.loops import (
     Step,
     log_run,
@@ -96,7 +96,7 @@ def run_system(
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def run_differentiable(capacity: RunCapacity, run: PyTree) -> PyTree:
+def run_differentiable(capacity: RunCapacity, run: tuple[PyTree, ...]) -> PyTree:
     """Return the run of (system, objectives, method, key), as `capacity.finish` makes it of the last carry."""
     hybrid, objectives, method, key = run
     every, static = jax.device_put(capacity.every), capacity._replace(room=0, every=0)
@@ -114,12 +114,12 @@ def _vary_together(run: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.where(run.diverged, x, x), run)
 
 
-def _rule(capacity: RunCapacity, primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
+def _rule(capacity: RunCapacity, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
     hybrid, objectives, method, _ = primals[0]
     refuse_derivative(hybrid, objectives, method)
     paths = differentiated_paths(tangents[0][0])
 
-    def reversible(run: PyTree) -> PyTree:
+    def reversible(run: tuple[PyTree, ...]) -> PyTree:
         return _vary_together(_run_reversible(prepare_derivatives(run[0], paths), *run[1:], capacity=capacity))
 
     return jvp_nonzero(reversible, primals, tangents, once=_second_derivative_objection(hybrid, method))
@@ -139,7 +139,7 @@ run_differentiable.defjvp(_rule, symbolic_zeros=True)
 
 @compile_once(static=("capacity",), options=SAME_RESULT_OPTIONS)
 def _run(
-    hybrid: HybridSystem, objectives: Objectives, method: PyTree, key: Key, every: Any, *, capacity: RunCapacity
+    hybrid: HybridSystem, objectives: Objectives, method: PyTree, key: Key, every: Int, *, capacity: RunCapacity
 ) -> PyTree:
     """Return a run for values, with capacity for the instants of a trajectory."""
     hybrid, objectives, stepped = _prepare_run(hybrid, objectives, method, key)
@@ -237,7 +237,7 @@ def _attach_trajectory(judged: tuple[PyTree, PyTree], first: PyTree, later: PyTr
     """Return the run with its trajectory: first and later instants, and the last one repeated after the end."""
     run, last = judged
 
-    def join(a: Scalar, b: Array, c: Scalar) -> PyTree:
+    def join(a: Scalar, b: Array, c: Scalar) -> Array:
         # Rows after the end contain anything, so the last instant replaces them.
         b = jnp.where(jnp.expand_dims(later.running, range(1, b.ndim)), b, c)
         return jnp.concatenate([jnp.asarray(a)[None], b])

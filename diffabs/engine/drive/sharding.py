@@ -80,7 +80,7 @@ def run_on_auto_mesh(run: Callable[..., PyTree], arguments: tuple[PyTree, ...]) 
     if not meshes:
         return run(*arguments)
 
-    def back(x: Array) -> Any:
+    def back(x: Array) -> Array:
         mesh = getattr(getattr(x, "sharding", None), "mesh", None)
         return _put_on_mesh(x, meshes[mesh]) if mesh in meshes else x
 
@@ -110,5 +110,5 @@ def _auto_mesh(mesh: Any) -> Mesh:
     return Mesh(mesh.devices, mesh.axis_names, axis_types=(AxisType.Auto,) * len(mesh.axis_names))
 
 
-def _put_on_mesh(x: jax.Array, mesh: Any) -> jax.Array:
+def _put_on_mesh(x: jax.Array, mesh: Mesh) -> jax.Array:
     return jax.device_put(x, NamedSharding(mesh, x.sharding.spec))  # pyright: ignore[reportAttributeAccessIssue]

@@ -136,7 +136,7 @@ class AdaptiveControl(NamedTuple):
     scale: PyTree
     tries: Int
     tries_at_renewal: Int
-    last_step: PyTree
+    last_step: StateSpan | tuple[()]
     consecutive_crossings: Int
     stability_fraction: Scalar
     accepted: Bool

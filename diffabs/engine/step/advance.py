@@ -20,7 +20,7 @@ from jax.typing import DTypeLike
 from diffabs.core.lanes import any_lane, jit_barrier, keep_decision, select
 from diffabs.core.log import borrow, log_rows, write_last_rows
 from diffabs.core.protocols import Clock
-from diffabs.core.types import Array, Bool, Int, PyTree, Scalar
+from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState, HybridSystem, Margins
 from diffabs.engine.step.attempt import (
     Attempt,
@@ -197,7 +197,7 @@ def advance(
     stepping: Stepping,
     hybrid: HybridSystem,
     objectives: Objectives,
-    key: PyTree,
+    key: Key | None,
     carry: Carry,
     until: Int | None = None,
 ) -> Carry:
@@ -287,7 +287,7 @@ def start_carry(
     stepping: Stepping,
     hybrid: HybridSystem,
     objectives: Objectives,
-    key: PyTree,
+    key: Key | None,
     forecast: Callable[[Evaluation], PyTree] = lambda dynamics: (),
 ) -> Carry:
     """Return the carry of a run at t = 0, without the numbers of the stepping method.

@@ -106,7 +106,9 @@ class SwitchedProgram:
         """Return the outputs that `pick` picks at (`moving`, `fixed`) in `mode`, and the answers to all comparisons."""
         return self._run(pick, moving, fixed, mode, True)
 
-    def _run(self, pick: Any, moving: PyTree, fixed: PyTree, mode: Mode, look: bool) -> tuple[PyTree, PyTree]:
+    def _run(
+        self, pick: Callable[[PyTree], PyTree], moving: object, fixed: object, mode: Mode, look: bool
+    ) -> tuple[PyTree, PyTree]:
         """Return the picked outputs and, with `look`, the answers to all comparisons; otherwise None.
 
         Only the operations that these outputs need are evaluated.

@@ -322,7 +322,7 @@ def _shows_curvature(end: tuple[PyTree, PyTree], place: Scalar, probe: Scalar) -
     return (jnp.abs(length - place) > 4 * jnp.abs(place - probe)) & jnp.isfinite(margin)
 
 
-def _falls_from_start(search: EventSearch, fall: Scalar, start: PyTree) -> Bool:
+def _falls_from_start(search: EventSearch, fall: Scalar, start: Array) -> Bool:
     """Return True if the margin is smooth and falls at the beginning of the step at `GRAZING_FRACTION` of its mean rate
     or faster.
 
@@ -363,7 +363,7 @@ def _slope(search: EventSearch, x: Scalar, g: AnyArray) -> Scalar:
     return jnp.where(jnp.isfinite(search.at_near) & jnp.isfinite(search.at_far), bent, far_slope)
 
 
-def _pick(number: Int, values: list[PyTree]) -> PyTree:
+def _pick(number: Int, values: list[PyTree]) -> Array:
     picked = values[0]
     for i, value in enumerate(values[1:], 1):
         picked = jnp.where(number == i, value, picked)

@@ -118,7 +118,7 @@ class ComparisonTrace:
         """Return the frozen answer, or the answer of the numbers, and record the contradiction and the margin."""
         first, shape = self.places[number]
 
-        def says() -> Any:
+        def says() -> Array:
             return jnp.greater(x, y) if strict else jnp.greater_equal(x, y)
 
         if self.mode.words is None:

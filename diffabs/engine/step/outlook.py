@@ -13,6 +13,7 @@ from diffabs.core.cubic import Cubic, HermiteStep
 from diffabs.core.lanes import any_lane
 from diffabs.core.types import Array, Bool, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState
+from diffabs.engine.step.advance import Carry
 from diffabs.engine.step.attempt import mode_in_step
 from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.system import Evaluation, ObservedSystem
@@ -91,7 +92,7 @@ def look_ahead(fresh: Bool, dynamics: Evaluation) -> Outlook:
     return Outlook(jnp.where(turned, -margins, margins), jnp.where(turned, -rates, rates))
 
 
-def watch_margins(carry: PyTree, h: Scalar, dynamics: Evaluation, bit_count: int) -> Turns:
+def watch_margins(carry: Carry, h: Scalar, dynamics: Evaluation, bit_count: int) -> Turns:
     """Return where margins turn back in an attempt; nowhere in the attempts of a search, before it lands."""
     margins, rates, numbers = _list_margins(dynamics, bit_count)
     running, landing = (carry.status == status for status in (RunStatus.RUNNING, RunStatus.LANDING))

@@ -16,7 +16,7 @@ Under XLA, both modes log the whole run and then replay it. Forward mode in a ke
 import dataclasses
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +33,9 @@ from diffabs.engine.step.modes import ModeBits
 from diffabs.engine.step.runge_kutta import TSIT5
 from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.system import Evaluation, Objectives, ObservedSystem
+
+T = TypeVar("T")
+
 
 # Capacity of the log: attempts at an rtol of 1e-5, and attempts for each instant of a grid with clocks.
 BASE_LOG_CAPACITY, LOG_CAPACITY_PER_TICK = 4096, 3
@@ -83,7 +86,7 @@ class ReplayControl(NamedTuple):
     """
 
     delay: Scalar
-    last_step: PyTree
+    last_step: StateSpan | tuple[()]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -314,7 +317,7 @@ def _time_to_zero(on: Bool, margin: Scalar, fall: Scalar, longest: Scalar) -> tu
     return close, -margin / jax.lax.stop_gradient(jnp.where(close, fall, 1.0))
 
 
-def _stop_gradients(tree: object) -> PyTree:
+def _stop_gradients(tree: T) -> T:
     return jax.tree.map(jax.lax.stop_gradient, tree)
 
 

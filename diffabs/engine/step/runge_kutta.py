@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from diffabs.core.lanes import rematerialise
 from diffabs.core.numerics import axpy
 from diffabs.core.tracing import jvp_nonzero
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Array, PyTree, Scalar
 
 X = TypeVar("X")
 
@@ -126,7 +126,7 @@ def _scanned_step(tableau: Tableau, f: Callable, t: Scalar, x: X, rate: X, h: Sc
     # Rows of equal length, padded with zeros: rates that do not exist yet are zero in the table.
     rows = [[*weights, *(count - len(weights)) * [0.0]] for weights in tableau.stages]
 
-    def weigh(weights: PyTree, rates: PyTree) -> PyTree:
+    def weigh(weights: Array, rates: PyTree) -> PyTree:
         return jax.tree.map(lambda k: jnp.sum(weights.reshape(-1, *(k.ndim - 1) * [1]) * k, axis=0), rates)
 
     def stage(rates: PyTree, at: tuple[PyTree, PyTree, PyTree]) -> tuple[PyTree, None]:
@@ -134,7 +134,7 @@ def _scanned_step(tableau: Tableau, f: Callable, t: Scalar, x: X, rate: X, h: Sc
         rate = f(t + place * h, axpy(h, weigh(weights, rates), x), *constants)
         return jax.tree.map(lambda k, x: k.at[new].set(jnp.asarray(x, k.dtype)), rates, rate), None
 
-    def begin_table(rate: Scalar) -> PyTree:
+    def begin_table(rate: Scalar) -> Array:
         rate = jnp.asarray(rate)
         return jnp.zeros((count, *rate.shape), rate.dtype).at[0].set(rate)
 
@@ -151,7 +151,7 @@ def _error_shares(tableau: Tableau, rates: Sequence[X]) -> X:
 
 
 def _weighted_sum(weights: Sequence[float], rates: Sequence[X]) -> X:
-    def total(*rates: PyTree) -> PyTree:
+    def total(*rates: Array) -> Array:
         terms = [weight * rate for weight, rate in zip(weights, rates, strict=True) if weight]
         return sum(terms[1:], terms[0]) if terms else 0.0 * rates[0]
 

@@ -4,7 +4,6 @@
 """
 
 from functools import reduce
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from diffabs.core.numerics import clamp
 from diffabs.core.types import Array, Int, PyTree, Scalar, Vector
-from diffabs.engine.hybrid import HybridState, HybridSystem
+from diffabs.engine.hybrid import HybridSample, HybridState, HybridSystem
 
 INITIAL_STEP_S = 1e-4  # s, the first step
 SAFETY, MIN_ERROR = 0.85, 1e-6  # fraction of the optimal length; offset that keeps the length finite for an error of 0
@@ -29,12 +28,14 @@ MAX_UNROLLED_STATES = 12  # numbers of a flow: the Jacobian of a larger one is n
 MIN_CROSSING_STEP_FRACTION = 4e-3  # fraction of the length that the error allows: the shortest step to a crossing
 
 
-def error_scales(state: HybridState, sample: PyTree) -> PyTree:
+def error_scales(state: HybridState, sample: HybridSample) -> PyTree:
     """Return the scales of the error: the sizes of the `error_signals` and of every state."""
     return sample.signal_scales(), jax.tree.map(jnp.abs, state.flow())
 
 
-def error_norm(hybrid: HybridSystem, state: HybridState, state_errors: Scalar, scale: Scalar, sample: PyTree) -> PyTree:
+def error_norm(
+    hybrid: HybridSystem, state: HybridState, state_errors: Scalar, scale: Scalar, sample: HybridSample
+) -> Array:
     """Return the greatest error of all states and of the `error_signals`, as a fraction of their scales.
 
     The errors of the states lie in the middle of the step. The signals are evaluated with them at the end of the
@@ -84,7 +85,7 @@ def spectral_step_limit(hybrid: HybridSystem, t: Array, state: HybridState, scal
     size = ravel_pytree(scale[1])[0]
     size = jnp.where(size > 0, size, 1.0)
 
-    def rates(flow: PyTree) -> Any:
+    def rates(flow: PyTree) -> Array:
         at = state.with_flow(unflatten(flow))
         return ravel_pytree(hybrid.flow(t, at, hybrid.signals(t, at)))[0]
 
@@ -95,7 +96,7 @@ def spectral_step_limit(hybrid: HybridSystem, t: Array, state: HybridState, scal
         # Scalars instead of a matrix product: for such small sums XLA on a CPU calls a library, at ten times the cost.
         rows = [[columns[j, i] for j in range(size.size)] for i in range(size.size)]
 
-    def longest(vector: list[PyTree]) -> Any:
+    def longest(vector: list[PyTree]) -> Array:
         return reduce(jnp.maximum, (jnp.max(jnp.abs(x)) if x.ndim else jnp.abs(x) for x in vector)) + MIN_NORM
 
     def multiply(at: tuple[list[PyTree], PyTree], counts: Int) -> tuple[tuple[list[PyTree], PyTree], None]:

@@ -177,7 +177,7 @@ def build_system(
     return ObservedSystem(traced[0], hybrid, objectives, traced[1], has_margin_rates)
 
 
-def trace_program(moving: PyTree, fixed: PyTree) -> SwitchedProgram:
+def trace_program(moving: object, fixed: object) -> SwitchedProgram:
     """Return the program of the dynamics with visible comparisons, for the arguments of `_evaluate`."""
     # `counts`: only comparisons that influence rates or recorded signals produce a kink in the run.
     return SwitchedProgram(_evaluate, moving, fixed, counts=lambda dynamics: (dynamics[:2], dynamics.signals.recorded))
@@ -201,7 +201,7 @@ def _find_asked_rates(
 
     def update(
         hybrid: HybridSystem, objectives: Objectives, state: HybridState, accumulators: Accumulators, t: Scalar
-    ) -> PyTree:
+    ) -> dict[str, PyTree]:
         sample = hybrid.signals(t, state).sample
         segment = Segment(
             *(sample, sample, t, t),
@@ -243,6 +243,6 @@ def _evaluate(moving: PyTree, fixed: PyTree) -> Instant:
 
 
 @jax.jit  # traced and differentiated once for all stages of a step
-def _evaluate_rates(moving: object, fixed: object) -> PyTree:
+def _evaluate_rates(moving: object, fixed: object) -> tuple[PyTree, dict[str, PyTree]]:
     """Return the rates of `_evaluate`."""
     return _evaluate(moving, fixed)[:2]

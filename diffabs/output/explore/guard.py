@@ -16,6 +16,8 @@ from typing import Any
 from starlette.requests import HTTPConnection  # pyright: ignore[reportMissingImports]  # the extra `explore`
 from starlette.responses import PlainTextResponse  # pyright: ignore[reportMissingImports]
 
+from diffabs.core.types import Table
+
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Any]]
 Send = Callable[[Any], Awaitable[None]]
@@ -91,7 +93,7 @@ def _loopback(client: Any) -> bool:
 
 
 def _with_policy(send: Send) -> Send:
-    async def sent(message: Any) -> None:
+    async def sent(message: Table) -> None:
         if message["type"] == "http.response.start":
             more = [(b"content-security-policy", POLICY.encode()), (b"x-content-type-options", b"nosniff")]
             message = {**message, "headers": [*message.get("headers", []), *more]}

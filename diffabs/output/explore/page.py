@@ -11,7 +11,6 @@ from typing import Any
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
-from diffabs.core.types import PyTree
 from diffabs.host.values import ScenarioError
 from diffabs.output.explore import charts, curves, stability
 from diffabs.output.explore.canvas import Canvas, encode_change
@@ -104,7 +103,7 @@ class Page:
             self.results.proved_box(_verdict(self.tools.judge, self.session))
         self.drawer.ask(partial(self._draw, now, self.version, edit, edited))
 
-    def later(self, show: Callable[..., None], *arguments: PyTree) -> None:
+    def later(self, show: Callable[..., None], *arguments: object) -> None:
         """Call show(*given) in the server's thread; workers change elements through `later` only."""
 
         def do() -> None:

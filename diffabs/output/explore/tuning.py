@@ -10,6 +10,7 @@ from diffabs.core.bijectors import reached_bound
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import PyTree
 from diffabs.host.values import ScenarioError
+from diffabs.loop.batch import Batch
 from diffabs.output.explore.knobs import Knob
 from diffabs.output.explore.stability import linear_stability, linearise_corners
 from diffabs.scenario.scenario import Scenario
@@ -24,7 +25,7 @@ OWN_OBJECTIVE = "[tune.objective]"  # no metric has this name
 class TuningTask(NamedTuple):
     """The runs of a tuning, as a batch, and its constraints."""
 
-    batch: PyTree
+    batch: Batch
     constraints: Sequence[PyTree]
 
 

@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from diffabs.core.blocks import offers
-from diffabs.core.protocols import Clock, Memory, Tracking
+from diffabs.core.protocols import Clock, Feedforward, Memory, Tracking
 from diffabs.core.pytree import ParameterSpec, arrays, parameters, prepare_parts
 from diffabs.core.tracing import depends_on_signal, leaf_dependence
 from diffabs.core.types import Part, PyTree, Scalar
@@ -68,7 +69,7 @@ class Parts(NamedTuple):
     """The parts with variable parameters; the reference is empty if the target comes from outside."""
 
     controller: Part
-    feedforward: Part
+    feedforward: Feedforward
     reference: Part = ()
 
 
@@ -142,7 +143,7 @@ class ComputerProgram:
 
 
 def computer_program(
-    loop: Loop, *, step: float | None = None, dtype: Any = np.float64, given_target: bool = False
+    loop: Loop, *, step: float | None = None, dtype: DTypeLike = np.float64, given_target: bool = False
 ) -> ComputerProgram:
     """Return the computer's part of a loop whose controller is `Sampled` or `SampledOnGrid`.
 
@@ -199,7 +200,7 @@ def _numbers(loop: Loop, typed: Loop, inputs: Input, given_target: bool) -> Iter
     """Yield the parameters that the computer's calculation depends on."""
     measured = inputs.measured
 
-    def ahead(plant: object) -> Any:
+    def ahead(plant: object) -> Scalar:
         return typed.feedforward.input(plant, measured, measured[0])
 
     families = ["controller", "feedforward", *(() if given_target else ("reference",))]
@@ -287,7 +288,7 @@ class _Work:
         loop = dataclasses.replace(self.loop, controller=controller, feedforward=prepare_parts(parts.feedforward))
         return loop if self.given_target else dataclasses.replace(loop, reference=prepare_parts(parts.reference))
 
-    def _time(self, state: State) -> PyTree:
+    def _time(self, state: State) -> Scalar:
         """Return the time of the sample [s]."""
         period = self.sampled.period
         return state.samples.astype(jnp.result_type(period)) * period
@@ -301,7 +302,7 @@ class _Work:
             target = loop.reference.output(t, reference, measured)
             setpoint = loop.reference.setpoint(reference)
 
-        def ahead(measured: object) -> Any:
+        def ahead(measured: object) -> Scalar:
             return loop.feedforward.input(loop.plant, measured, setpoint)
 
         # Only measurements that the feed-forward depends on can spoil it. The controller checks the others itself.

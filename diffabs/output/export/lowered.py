@@ -5,7 +5,7 @@ code for any language.
 """
 
 import re
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -99,7 +99,7 @@ class Lowered:
         return [name for name in self.state if name in names]
 
 
-def number_leaves(shape: PyTree, graph: Graph, where: str, flat: PyTree) -> dict[str, Node]:
+def number_leaves(shape: object, graph: Graph, where: str, flat: PyTree) -> dict[str, Node]:
     """Return an input node for each number in a pytree's leaves, by name.
 
     Args:
@@ -134,7 +134,9 @@ def fill_shapes(shape: object, nodes: dict[str, Node]) -> list[NodeArray]:
     return arrays
 
 
-def trace_outputs(graph: Labelled, function: Any, shape: PyTree, inputs: list[NodeArray]) -> list[Node]:
+def trace_outputs(
+    graph: Labelled, function: Callable[..., PyTree], shape: object, inputs: list[NodeArray]
+) -> list[Node]:
     """Return the results of a function as one list of nodes, leaf by leaf and entry by entry.
 
     Arrays that the function closes over become constants.

@@ -16,8 +16,9 @@ from diffabs.compiler.emit.c99_words import Words
 from diffabs.compiler.ir import Node, UpdateLevel, is_real, live_nodes
 from diffabs.compiler.lower.labels import Labelled
 from diffabs.compiler.lower.rules import Unsupported
+from diffabs.core.protocols import Plant
 from diffabs.core.pytree import ParameterSpec, canonical_dtypes, parameters, prepare_parts
-from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.core.types import PyTree, Scalar
 from diffabs.core.units import unit_at
 from diffabs.engine.step.runge_kutta import rk4_step
 from diffabs.loop.closed_loop import Loop
@@ -165,7 +166,7 @@ class _Written:
         yield "}\n"
 
 
-def _advance_state(plant: Part, state: PyTree, control: Scalar, t: Scalar, h: Scalar) -> PyTree:
+def _advance_state(plant: Plant, state: PyTree, control: Scalar, t: Scalar, h: Scalar) -> PyTree:
     """Return the state after a step with constant control, as `FixedStep` computes it."""
     plant = prepare_parts(plant)
     return plant.project(rk4_step(lambda t, x: plant.derivative(t, x, control), t, state, h))

@@ -4,19 +4,19 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
-from diffabs.core.types import PyTree
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.robustness import frequencies
 from diffabs.linear.stability_margins import Margins
-from diffabs.output.plot.style import COLOURS, GREY, label_axes, make_logarithmic, sheet
+from diffabs.output.plot.style import COLOURS, GREY, Sheet, label_axes, make_logarithmic, sheet
 
 MAX_NYQUIST_RADIUS = 3.0  # largest real or imaginary part that the Nyquist plot shows
 LIGHT = 0.25  # opacity of the band
 LEAST_DB = -80.0  # lower end of the magnitude axis; half of it for the sensitivities
 
 
-def loop_shape(loop: OpenLoop, margins: Margins, band: Sequence[OpenLoop] = (), *, title: str = "") -> PyTree:
+def loop_shape(loop: OpenLoop, margins: Margins, band: Sequence[OpenLoop] = (), *, title: str = "") -> Sheet:
     """Return a figure of the open loop L, which includes the controller, and its sensitivities S and T.
 
     The panels are magnitude and phase of L, its Nyquist plot, and |S| and |T|. For a stable loop the Nyquist plot has a
@@ -68,7 +68,7 @@ def _degrees(values: np.ndarray) -> np.ndarray:
     return np.degrees(angles - 2 * np.pi * np.ceil(near / (2 * np.pi)))
 
 
-def _draw_band(ax: Any, w: np.ndarray, main: np.ndarray, around: np.ndarray, colour: str, name: str) -> None:
+def _draw_band(ax: Axes, w: np.ndarray, main: np.ndarray, around: np.ndarray, colour: str, name: str) -> None:
     """Draw a curve over the band between the smallest and the largest value of the other curves."""
     if len(around):
         ax.fill_between(w, around.min(axis=0), around.max(axis=0), color=colour, alpha=LIGHT, linewidth=0)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from diffabs.core.types import AnyArray
 from diffabs.output.plot.style import COLOURS, Figure, label_axes, sheet
 
 
@@ -19,8 +20,8 @@ class MeasuredPanel(NamedTuple):
 
     label: str
     t: Any
-    measured: Any
-    simulated: Any
+    measured: AnyArray
+    simulated: AnyArray
     name: str
 
 

@@ -1,10 +1,10 @@
 """Figures of runs: an overview of one run, several runs side by side, friction curves and convergence."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from diffabs.core.protocols import Road
 from diffabs.core.types import Table
@@ -165,7 +165,9 @@ def draw_angle_lines(ax: Axes, trajectory: Trajectory, suffix: str = "") -> None
         ax.plot(np.asarray(trajectory.sample.t), values, label=f"{words} {name}", **curve_style(i))
 
 
-def shade_region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) -> list[Patch]:
+def shade_region(
+    ax: Axes, first: ArrayLike, second: ArrayLike, inside: ArrayLike, unknown: ArrayLike | None = None
+) -> list[Patch]:
     """Shade the cells of a grid by a Boolean value, and return three patches for a legend.
 
     The patches stand for true, unknown and false, in this order.

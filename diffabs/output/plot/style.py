@@ -13,6 +13,7 @@ import textwrap
 from typing import Any
 
 import numpy as np
+from matplotlib.backend_bases import RendererBase
 
 from diffabs.core.types import PyTree
 from diffabs.host import files
@@ -41,7 +42,7 @@ TITLE_SIZE = 9  # characters per inch, with room to spare
 class Sheet(Figure):
     """A figure that shows every text literally: a dollar sign in a title or a name starts no formula."""
 
-    def draw(self, renderer: Any) -> None:
+    def draw(self, renderer: RendererBase) -> None:
         """Draw the figure with the `renderer`, without formulas in its texts."""
         for ax in self.axes:
             # matplotlib makes tick labels on access; without it findobj would miss them.

@@ -38,7 +38,7 @@ ROW = 0.055  # height of a line of text beside the axes, as a share of their hei
 ABOVE = dict(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False, fontsize=9, handlelength=1.5)
 
 
-def draw_sweep(results: Results, document: Any, folder: pathlib.Path, units: Mapping[str, str]) -> list[pathlib.Path]:
+def draw_sweep(results: Results, document: Table, folder: pathlib.Path, units: Mapping[str, str]) -> list[pathlib.Path]:
     """Write every figure that has content as PNG, and return the paths."""
     figures = {
         "distributions": draw_distributions(results, units),

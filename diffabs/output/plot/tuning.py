@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
-from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.core.types import PyTree, Scalar
+from diffabs.loop.closed_loop import Loop
 from diffabs.loop.result import Trajectory
 from diffabs.loop.run import rollout
 from diffabs.output.plot.style import (
@@ -49,7 +50,7 @@ def draw_worst_run(work: "Work", tuned: "Tuned") -> Figure:
     worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in scenario.tune.objective.items())))
     solver = dataclasses.replace(scenario.solver, every=min(scenario.solver.every, scenario.solver.steps))
 
-    def roll_out(loop: Part) -> Trajectory:
+    def roll_out(loop: Loop) -> Trajectory:
         run = jax.device_get(rollout(work.batch.lane(loop, worst), solver, key=scenario.key()))
         assert run.trajectory is not None
         return run.trajectory

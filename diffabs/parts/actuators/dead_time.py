@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import param, pytree, static
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Array, PyTree, Scalar
 from diffabs.parts.actuators.delay import find_wrong_capacity
 
 
@@ -33,7 +33,7 @@ class DeadTimeMemory(NamedTuple):
 
     applied: Scalar
     newest: Scalar
-    due: Any
+    due: Array
     values: Any
 
 

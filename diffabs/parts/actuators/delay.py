@@ -273,7 +273,7 @@ def _differ(before: tuple[PyTree, PyTree], after: tuple[PyTree, PyTree]) -> Scal
     return jnp.any(jnp.stack(jumps))
 
 
-def _time_tolerance(t: Any) -> Any:
+def _time_tolerance(t: Array) -> Array:
     """Return the bound on the difference of two computations of the time t [s]."""
     return TIME_EPS * jnp.finfo(jnp.result_type(t)).eps * jax.lax.stop_gradient(t)
 
@@ -290,7 +290,7 @@ def _count(ends: list[PyTree], t: Array, low: Scalar, high: Scalar) -> Array:
 
 
 @_count.defjvp
-def _constant(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
+def _constant(at: tuple[Scalar, ...], moves: tuple[Scalar, ...]) -> tuple[PyTree, PyTree]:
     del moves
     count = _count(*at)
     return count, jnp.zeros_like(count)
@@ -302,5 +302,5 @@ def _at_most_one(x: Scalar) -> Scalar:
 
 
 @_at_most_one.defjvp
-def _slope(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
+def _slope(at: tuple[Scalar, ...], moves: tuple[Scalar, ...]) -> tuple[PyTree, PyTree]:
     return _at_most_one(*at), jnp.where(at[0] <= 1.0, moves[0], 0.0)

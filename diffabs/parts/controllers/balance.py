@@ -16,7 +16,7 @@ import numpy as np
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import BalanceOutput, Clock, Memory, Tracking, no_flow, no_memory
 from diffabs.core.pytree import param, pytree
-from diffabs.core.types import Matrix, PyTree, Scalar, Vector
+from diffabs.core.types import Array, Matrix, PyTree, Scalar, Vector
 
 STATE_NAMES = ("theta", "psi", "phi", "theta_rate", "psi_rate", "phi_rate")
 MEASURED_NAMES = ("theta", "psi")
@@ -24,7 +24,7 @@ MEASURED_NAMES = ("theta", "psi")
 DEFAULT_BALANCE_GAIN = (24208.064, 2293.1921, 7667.1, 8683.2995, 889.36867, 2860.7285)
 
 
-def state_of(output: BalanceOutput) -> PyTree:
+def state_of(output: BalanceOutput) -> Array:
     """Return the state x = (theta, psi, phi, theta', psi', phi') [rad, rad/s] from a plant output, shape (6,)."""
     return jnp.stack([getattr(output, name) for name in STATE_NAMES])
 

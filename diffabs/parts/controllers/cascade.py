@@ -44,7 +44,7 @@ class Cascade:
         inner = self.inner.start(self._inner_signal(0.0, outer, signal))
         return Memory((outer.flow, inner.flow), (outer.held, inner.held))
 
-    def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> PyTree:
+    def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> tuple[PyTree, ...]:
         """Return the rates of both memories."""
         outer, inner = self._memories(memory)
         rate = self.outer.flow(t, outer, self._outer_signal(signal))

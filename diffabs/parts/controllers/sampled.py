@@ -12,7 +12,7 @@ and output then keep the values of the previous sample.
 import dataclasses
 from collections.abc import Iterator
 from functools import reduce
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,9 @@ from diffabs.parts.controllers.antiwindup import BackCalculation, Clamping
 from diffabs.parts.controllers.cascade import CASCADED, Cascade
 from diffabs.parts.controllers.pid import PID
 from diffabs.parts.controllers.torque_logic import BandLogic
+
+T = TypeVar("T")
+
 
 PERIOD_EPS = 16.0  # in machine epsilons of the time: closer instants count as equal
 
@@ -150,7 +153,7 @@ class Sampled:
             return self
         return _AlwaysWaits(controller=self.controller, period=self.period, delay=self.delay)
 
-    def _until(self, t: Scalar) -> PyTree:
+    def _until(self, t: Scalar) -> Scalar:
         """Return the time at which the output sampled at time t is applied [s].
 
         The time is a rounding early. An event exactly on a grid instant would not end a step. The maximum of a run at
@@ -196,11 +199,11 @@ def _at_period(controller: Part, period: Scalar) -> Part:
     return dataclasses.replace(controller, antiwindup=antiwindup.at_period(period))
 
 
-def _refuse_rate() -> PyTree:
+def _refuse_rate() -> NoReturn:
     raise ValueError("the signal of a sampled controller has no rate: its `margins` cannot call rate()")
 
 
-def replace_nan(signal: object) -> PyTree:
+def replace_nan(signal: T) -> T:
     """Return a signal with 0 in place of NaN, so that a memory that starts from it is finite."""
     return jax.tree.map(lambda x: jnp.where(jnp.isnan(x), 0.0, x), signal)
 

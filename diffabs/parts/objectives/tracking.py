@@ -231,7 +231,7 @@ class SettlingTime(HeldValue):
         outside = jnp.abs(tracking_error(last)) > self._width(last, memory.held.first)
         return jnp.where(outside, self.unreached, memory.held.entered)
 
-    def _width(self, sample: PyTree, first: Scalar) -> PyTree:
+    def _width(self, sample: PyTree, first: Scalar) -> Scalar:
         """Return half the width of the band, for a sample or another tuple with a `setpoint`."""
         return larger(self.share * jnp.abs(sample.setpoint - first), self.band)
 
@@ -348,7 +348,7 @@ class QuadraticCost(Integral):
         """Return the memory with both integrals 0."""
         return Memory(flow=Quadratic(*(0.0 * sample.output[0],) * 2))
 
-    def flow(self, memory: Memory, sample: Sample) -> PyTree:
+    def flow(self, memory: Memory, sample: Sample) -> Quadratic:
         """Return e and the integrand of the cost."""
         x1, x2, u = memory.flow.error, tracking_error(sample), sample.control - sample.feedforward
         return Quadratic(x2, self.q[0] * x1**2 + self.q[1] * x2**2 + self.r * u**2)

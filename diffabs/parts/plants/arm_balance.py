@@ -24,10 +24,11 @@ the spinning rotor on the frame.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from diffabs.core.numerics import clamp, quotient
 from diffabs.core.protocols import BalanceOutput
@@ -328,7 +329,7 @@ def _at_rest(lumps: Lumps, rotor: Scalar) -> np.ndarray:
     return np.stack([_columns(m11, m12, m13), _columns(m12, m22, zero), _columns(m13, zero, m33)], axis=-2)
 
 
-def _columns(*columns: Any) -> np.ndarray:
+def _columns(*columns: ArrayLike) -> np.ndarray:
     return np.stack(np.broadcast_arrays(*columns), axis=-1)
 
 

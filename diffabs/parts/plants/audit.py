@@ -11,8 +11,6 @@ be greater inside the step. A nonnegative brake torque does no work on the vehic
 gains: a negative torque that drives the wheel, or a motor that rights a two-wheeler.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -28,7 +26,7 @@ SWING = 4.0  # factor on the decelerations at both ends: the slip may pass the f
 MIN_STEP_ENERGY = 10.0  # m/s^2, deceleration that is always accepted, as is 1e-3 of the speed
 
 
-def _driving_power(before: Any, after: Any) -> Scalar:
+def _driving_power(before: Scalar, after: Scalar) -> Scalar:
     """Return the greater of both values, and 0 where both are negative."""
     return jnp.maximum(jnp.maximum(before, after), 0.0)
 

@@ -32,7 +32,7 @@ meets such friction later has diverged.
 
 import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ from diffabs.core.numerics import clamp, larger, quotient, smaller
 from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import param, part, pytree
 from diffabs.core.rules import Rule
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Numbers, PyTree, Scalar
 from diffabs.parts.plants.audit import BrakeAudit
 from diffabs.parts.plants.wheel import BrakedWheel, BrakeStart, forward_speed, halt_at_zero, slip_ratio
 from diffabs.parts.roads import RIG
@@ -205,5 +205,5 @@ class LabRig(BrakedWheel):
         limit = jnp.tan(angle) if isinstance(angle, jax.Array) else np.tan(angle)
         yield stays_below(friction, limit, "tan(lever_angle)", "the lever locks itself").under("road.")
 
-    def _drum_torque(self, drum: Scalar, push: Scalar) -> Any:
+    def _drum_torque(self, drum: Scalar, push: Scalar) -> Numbers:
         return push * self.drum_radius + self.drum_friction * drum + jnp.where(drum > 0, self.drum_stiction, 0.0)

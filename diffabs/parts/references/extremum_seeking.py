@@ -25,7 +25,7 @@ from diffabs.core.numerics import clamp, larger
 from diffabs.core.protocols import BrakeOutput, Memory
 from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import Rule, order_rule
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Scalar
 
 
 class SeekingMemory(NamedTuple):
@@ -98,7 +98,7 @@ class ExtremumSeeking:
         """Return s, the present estimate of the best slip without the dither [1]."""
         return jnp.exp(memory.flow.logarithm)
 
-    def elasticity(self, memory: Memory) -> PyTree:
+    def elasticity(self, memory: Memory) -> Scalar:
         """Return the estimate e of d ln(deceleration)/d ln(slip) from `memory` [1].
 
         It is positive below the peak and negative beyond it.

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
 from diffabs.core.pytree import param, pytree
-from diffabs.core.types import PyTree, Scalar
+from diffabs.core.types import Bool, PyTree, Scalar
 
 # A later maximum counts only if it exceeds the greatest by this fraction. A controller that holds the best slip keeps
 # the deceleration equal to its maximum up to rounding; comparisons of equal numbers would then decide the derivatives.
@@ -205,5 +205,5 @@ def _falling_rate(rate: Scalar, deceleration: Scalar, m: PeakMemory) -> Scalar:
     return jnp.where(deceleration > (1 + SLIP_MARGIN) * m.greatest, rate, jnp.abs(rate))
 
 
-def _record_peak(m: PeakMemory, new: PyTree, deceleration: Scalar, slip: Scalar) -> PeakMemory:
+def _record_peak(m: PeakMemory, new: Bool, deceleration: Scalar, slip: Scalar) -> PeakMemory:
     return m._replace(greatest=jnp.where(new, deceleration, m.greatest), slip=jnp.where(new, slip, m.slip))

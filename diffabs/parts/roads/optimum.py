@@ -91,5 +91,5 @@ def _newton_step(residual: Scalar, rate: Scalar) -> Scalar:
 
 
 @_newton_step.defjvp
-def _step_slope(at: PyTree, moves: PyTree) -> tuple[PyTree, PyTree]:
+def _step_slope(at: tuple[Scalar, ...], moves: tuple[Scalar, ...]) -> tuple[PyTree, PyTree]:
     return _newton_step(*at), moves[0] / jnp.where(at[1] == 0, jnp.nan, at[1])

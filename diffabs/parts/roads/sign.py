@@ -7,8 +7,9 @@ from jax.core import Tracer
 from jax.tree_util import Partial
 
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once
+from diffabs.core.protocols import Road
 from diffabs.core.rules import Rule
-from diffabs.core.types import AnyArray, Part, Scalar
+from diffabs.core.types import AnyArray, Scalar
 
 SPEED = 10.0  # m/s, at which the sign of a road's friction is checked
 MAX_FRICTION_AT_REST = 1e-6  # |mu| at slip 0, more than rounding
@@ -58,7 +59,7 @@ def find_wrong_sign(road: object) -> str:
     return f"friction = {mu[first]:.3g} at slip {slip:g}; {needed}"
 
 
-def _friction_of(road: Part, slip: Scalar) -> Scalar:
+def _friction_of(road: Road, slip: Scalar) -> Scalar:
     return road.friction(slip, SPEED, 0.0)
 
 

@@ -1,7 +1,6 @@
 """Sensor errors: noise, bias and quantisation, mostly with one parameter per measured channel."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from diffabs.core.numerics import axpy
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import period_on_grid
-from diffabs.core.types import Key, PyTree, Scalar, Vector
+from diffabs.core.types import Array, Key, PyTree, Scalar, Vector
 
 
 @pytree
@@ -132,7 +131,7 @@ class PlayedWheelNoise:
 
 
 @jax.custom_jvp
-def draw_noise(deviation: Scalar, key: Key, number: Scalar) -> PyTree:
+def draw_noise(deviation: Scalar, key: Key, number: Scalar) -> Array:
     """Return deviation * z as a scalar, with z standard normal; a draw happens only if necessary.
 
     A deviation of 0 without a tangent draws nothing and returns 0. The tangent is z times the deviation's tangent, also
@@ -152,7 +151,7 @@ def _rule(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
 draw_noise.defjvp(_rule, symbolic_zeros=True)
 
 
-def _normal(like: PyTree, key: Key, number: Scalar) -> Any:
+def _normal(like: PyTree, key: Key, number: Scalar) -> Array:
     return jax.random.normal(jax.random.fold_in(key, number), (), like.dtype)
 
 
@@ -219,7 +218,7 @@ class Quantisation:
         )
 
 
-def _round_to(x: Scalar, q: Scalar) -> Any:
+def _round_to(x: Scalar, q: Scalar) -> Array:
     # For q = 0 the divisor is 1, so that the branch not taken holds no NaN.
     divisible = jnp.greater(q, 0)
     q = jnp.where(divisible, q, 1.0)

@@ -54,7 +54,7 @@ class ProofTask(NamedTuple):
     loop: Loop
     reduced: ReducedLoop
     gain: np.ndarray
-    model: Part
+    model: object
     states: tuple[str, ...]
     over: Box
     polytope: Polytope

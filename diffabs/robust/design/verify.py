@@ -24,7 +24,7 @@ import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 Matrix = list[list[Fraction]]
 # Limits of a file: bytes; states or inputs; vertices, cells or points.
@@ -155,7 +155,7 @@ def _read_json(path: pathlib.Path) -> Any:
         raise ValueError(f"is not JSON: {error}") from None
 
 
-def _reject_constant(word: str) -> Any:
+def _reject_constant(word: str) -> NoReturn:
     raise ValueError(f"{word} is not a number that can be proved anything about")
 
 

@@ -394,7 +394,7 @@ class _Derivation:
 
         period = self.period or 0.0
 
-        def after(loop: Loop, state: PyTree, t: Scalar, h: Scalar, k: Int) -> PyTree:
+        def after(loop: Loop, state: LoopState, t: Scalar, h: Scalar, k: Int) -> LoopState:
             whole = self.loop_state(loop, state)
             clock = tick_clock(period, t, h, k)
             return loop.change(clock, whole, loop.signals(t, whole), {}, {}, None)._replace(plant=state.plant)
@@ -820,7 +820,7 @@ def _exact_values(roots: list[Node], inputs: list[Fraction]) -> list[Any]:
             exact[node.id] = compute(node)
         return exact[node.id]
 
-    def compute(node: Node) -> Any:
+    def compute(node: Node) -> Fraction | bool:
         if node.op == "const":
             return bool(node.attr) if node.dtype == bool else Fraction(float(node.attr))
         if node.op == "input":

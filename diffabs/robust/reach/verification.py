@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
 
 from diffabs.core.renamed import refuse_old_names
-from diffabs.core.types import JsonObject
+from diffabs.core.types import JsonObject, Table
 from diffabs.host.values import format_given
 from diffabs.loop.closed_loop import Loop
 from diffabs.robust.reach.certificate import FORMAT, proved_ends
@@ -142,15 +142,15 @@ def _read_tail(document: JsonObject, params: int) -> RunTail:
     table = {f"tail.{name}": value for name, value in table.items()}
     states = tuple(_read_entries(table, "tail.states", list, str, "a name").values())
 
-    def numbers(values: Any, count: int) -> tuple[float, ...]:
+    def numbers(values: Sequence[object], count: int) -> tuple[float, ...]:
         if len(values) != count:
             raise ValueError("another number of numbers")
         return tuple(map(_number, values))
 
-    def ranges(values: Any) -> dict[str, tuple[float, float]]:
+    def ranges(values: Table) -> dict[str, tuple[float, float]]:
         return {str(name): (ends[0], ends[1]) for name, ends in ((n, _pair(e)) for n, e in values.items())}
 
-    def piece(entry: Any) -> TailPiece:
+    def piece(entry: Table) -> TailPiece:
         n = len(states)
         if len(entry["by_param"]) != n:
             raise ValueError("another number of states")
@@ -202,12 +202,12 @@ def _read_entries(
     return entries
 
 
-def _pair(pair: Any) -> list[float]:
+def _pair(pair: Sequence[object]) -> list[float]:
     low, high = pair
     return [_number(low), _number(high)]
 
 
-def _open_pair(pair: Any) -> tuple[float | None, float | None]:
+def _open_pair(pair: Sequence[object]) -> tuple[float | None, float | None]:
     """Return a pair of finite numbers or None. Raises TypeError or ValueError for anything else."""
     low, high = pair
     return None if low is None else _number(low), None if high is None else _number(high)

@@ -100,7 +100,7 @@ class ResidualEvaluation(NamedTuple):
 
 @partial(jax.jit, static_argnames=("free", "residuals"))
 def _evaluate_residuals(
-    free: FreeSpace, residuals: Residuals, prior: Prior, part: Part, data: PyTree, z: AnyArray
+    free: FreeSpace, residuals: Residuals, prior: Prior, part: Part, data: tuple[PyTree, ...], z: AnyArray
 ) -> ResidualEvaluation:
     """Return residuals, prior and derivatives at z; compiled once for equal functions, spaces and structures."""
 

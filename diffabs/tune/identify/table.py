@@ -10,7 +10,7 @@ import numpy as np
 
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, get, parameters, replace
-from diffabs.core.types import Part, PyTree, Scalar, Vector
+from diffabs.core.types import Array, Params, Part, PyTree, Scalar, Vector
 from diffabs.core.validity import check_part
 from diffabs.engine.solvers import Solver
 from diffabs.loop.batch import Batch, group_by_structure, stack_loops
@@ -109,8 +109,8 @@ class _MetricResiduals:
         values = {path: get(part, path) for path in self.shared}
         return [Batch(rows).each(loop, lambda row, key: function(replace(row, values))) for loop, rows in batches]
 
-    def __call__(self, part: Part, batches: Any, place: Vector, target: Scalar) -> Any:
-        def row(loop: Part) -> PyTree:
+    def __call__(self, part: Part, batches: Sequence[Params], place: Vector, target: Scalar) -> Array:
+        def row(loop: Loop) -> Array:
             metrics = measure(loop, self.solver, dict(self.objectives)).metrics
             return jnp.stack([metrics[name] for name, _ in self.objectives])
 

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ import numpy as np
 
 from diffabs.core.numerics import clamp, ratio
 from diffabs.core.pytree import canonical_dtypes
-from diffabs.core.types import Matrix, Params, Part, Scalar, Table, Vector
+from diffabs.core.types import Array, Matrix, Params, Scalar, Table, Vector
 from diffabs.engine.solvers import FixedStep, Solver
 from diffabs.loop.batch import Batch
 from diffabs.loop.closed_loop import Loop
@@ -172,11 +171,11 @@ class _TraceResiduals:
     solver: Solver
     fields: tuple[str, ...]
 
-    def __call__(self, loop: object, over: Params, t: Vector, compared: object, target: Scalar) -> Any:
+    def __call__(self, loop: object, over: Params, t: Vector, compared: object, target: Scalar) -> Array:
         simulated = Batch(over).each(canonical_dtypes(loop), lambda run_loop, key: self._columns(run_loop, t))
         return jnp.swapaxes(simulated, 0, 1).ravel()[compared] - target
 
-    def _columns(self, loop: Part, t: Vector) -> Matrix:
+    def _columns(self, loop: Loop, t: Vector) -> Matrix:
         """Return the simulated columns of one run at the instants t, shape (columns, n); NaN if the run diverged."""
         run = rollout(loop, self.solver)
         assert run.trajectory is not None

@@ -18,7 +18,7 @@ of the width.
 
 import dataclasses
 from collections.abc import Collection, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -96,7 +96,12 @@ class Uncertainty:
 
 
 def uncertainty(
-    names: Sequence[str], size: np.ndarray, data: PyTree, prior: Any, scale: float, held: Collection[str] = ()
+    names: Sequence[str],
+    size: np.ndarray,
+    data: np.ndarray,
+    prior: np.ndarray,
+    scale: float,
+    held: Collection[str] = (),
 ) -> Uncertainty:
     """Return covariance, correlation and directions from scaled Jacobians.
 

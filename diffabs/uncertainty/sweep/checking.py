@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.pytree import refine_parts
-from diffabs.core.types import Bool, JsonObject, Key, Part
+from diffabs.core.types import Bool, JsonObject, Key
 from diffabs.engine.solvers import describe_solver, refine_solver
 from diffabs.loop.accuracy import is_comparable
 from diffabs.loop.batch import Batch, group_by_structure, stack_loops
+from diffabs.loop.closed_loop import Loop
 from diffabs.loop.result import differs_in_kind
 from diffabs.uncertainty.sweep.runner import Columns, Runner
 from diffabs.uncertainty.sweep.study import Study, is_accepted, precision
@@ -116,7 +117,7 @@ def _draw_same_noise(study: Study, samples: np.ndarray) -> np.ndarray:
         loop = jax.tree.map(np.asarray, loop)  # an array of JAX would ask for its double precision in single
         lanes = batch.values, jnp.stack([keys[i] for i in places])
 
-        def compare(loop: Part, key: Key) -> Bool:
+        def compare(loop: Loop, key: Key) -> Bool:
             return is_comparable(loop, study.solver, key, (2,))
 
         with precision(study.dtype):

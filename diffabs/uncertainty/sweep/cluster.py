@@ -225,7 +225,7 @@ def _wait_for_chunk(client: Client, finished: as_completed, stopping: Callable[[
 def _convert_to_numpy(study: Study) -> Study:
     """Return the study with NumPy arrays: a process with float32 as default would halve the digits of JAX arrays."""
 
-    def plain(x: Scalar) -> Any:
+    def plain(x: Scalar) -> np.ndarray | float | int:
         return np.asarray(x) if isinstance(x, jax.Array) else x
 
     # One by one: `tree.map` over the dictionaries would sort their keys, and so change the order of the columns.

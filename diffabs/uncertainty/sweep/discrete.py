@@ -45,7 +45,7 @@ class _Discrete:
     def value(self, u: ArrayLike) -> Any:
         raise NotImplementedError
 
-    def from_normal(self, z: ArrayLike) -> Any:
+    def from_normal(self, z: ArrayLike) -> np.ndarray:
         from scipy.special import ndtr
 
         return self.value(ndtr(z))

@@ -4,6 +4,7 @@ import contextlib
 import os
 import pathlib
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -12,7 +13,7 @@ import pyarrow.parquet as pq
 from diffabs.core.optional import import_optional
 from diffabs.core.shapes import Bool, Shaped
 from diffabs.core.summary import Summary
-from diffabs.core.types import JsonObject, PyTree, Scalar
+from diffabs.core.types import JsonObject, Scalar
 from diffabs.host import files
 from diffabs.host.values import ScenarioError, unknown_name_error
 from diffabs.uncertainty.sweep import seal
@@ -20,6 +21,10 @@ from diffabs.uncertainty.sweep.manifest import Seals, read_manifest
 from diffabs.uncertainty.sweep.seal import SweepError
 from diffabs.uncertainty.sweep.store import list_chunks, read_chunk
 from diffabs.uncertainty.sweep.study import FLAG_COLUMNS, failure_masks, is_accepted
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 
 class Results:
@@ -165,7 +170,7 @@ class Results:
         """
         return self.table([name]).column(name).to_numpy()
 
-    def pandas(self) -> PyTree:
+    def pandas(self) -> "pandas.DataFrame":
         """Return a pandas.DataFrame indexed by sample, with a column `failed`, and units in `attrs["units"]`."""
         import_optional("pandas")
         frame = self.table().to_pandas().set_index("sample").assign(failed=self.failed_samples())
@@ -178,7 +183,7 @@ class Results:
         frame = polars.from_arrow(self.table())
         return frame.with_columns(polars.Series("failed", self.failed_samples()))
 
-    def xarray(self) -> PyTree:
+    def xarray(self) -> "xarray.Dataset":
         """Return an xarray.Dataset over the dimension `sample`, with `units` at its variables."""
         import_optional("xarray")
         data = self.pandas().to_xarray()

@@ -29,6 +29,7 @@ from diffabs.engine.solvers import Solver
 from diffabs.host.process import default_devices, default_platform
 from diffabs.loop.admissible import batch_admissibility
 from diffabs.loop.batch import Batch
+from diffabs.loop.closed_loop import Loop
 from diffabs.loop.ensemble import run_batch
 from diffabs.uncertainty.sweep.study import FLAG_COLUMNS, Study, noise_key, precision
 
@@ -137,7 +138,7 @@ class Runner:
         converted = jax.tree.map(lambda x: np.asarray(x, self.study.dtype), numbers)
         return *converted, np.asarray(self.study.seed), block.samples.astype(np.uint32), accepted
 
-    def _variant(self, names: tuple[str, ...]) -> Any:
+    def _variant(self, names: tuple[str, ...]) -> Loop:
         return self.study.variant(dict(zip(self.study.parts, names, strict=True)))
 
 
@@ -172,7 +173,7 @@ def _find_objection(study: Study, platform: str) -> str | None:
 
 @partial(jax.jit, static_argnames=("solver", "engine"))
 def _measure_block(
-    loop: Part,
+    loop: Loop,
     objectives: Mapping[str, Objective],
     values: Params,
     seed: Int,

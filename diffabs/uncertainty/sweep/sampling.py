@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.shapes import Float, UInt
-from diffabs.core.types import PyTree, Table
+from diffabs.core.types import Int, PyTree, Table
 from diffabs.host.values import (
     check_sound,
     find_field_faults,
@@ -33,7 +33,7 @@ from diffabs.host.values import (
     table_reader,
     whole_reader,
 )
-from diffabs.uncertainty.sweep.distributions import support_interval
+from diffabs.uncertainty.sweep.distributions import Distribution, support_interval
 
 # Largest number of samples, whose numbers have 32 bits in JAX's keys and in the sequences; and largest seed.
 MAX_UINT32 = 2**32 - 1
@@ -82,7 +82,7 @@ class Random(SamplingDesign):
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
-def _random_words(seed: Any, start: PyTree, count: int, dimension: int) -> UInt[jax.Array, "{count} variables 2"]:
+def _random_words(seed: Int, start: Int, count: int, dimension: int) -> UInt[jax.Array, "{count} variables 2"]:
     key = jax.random.key(seed, impl="threefry2x32")
     numbers = start + jax.lax.iota(jnp.uint32, count)
     return jax.vmap(lambda i: jax.random.bits(jax.random.fold_in(key, i), (dimension, 2), jnp.uint32))(numbers)
@@ -331,7 +331,7 @@ def _check_exact_count(count: int, samples: int | None, meaning: str) -> int:
     return _check_samples(count)
 
 
-def _support_problems(name: str, path: str, variable: Any, design: str) -> Iterator[str]:
+def _support_problems(name: str, path: str, variable: Distribution, design: str) -> Iterator[str]:
     support = support_interval(variable)
     if support.open_low or support.open_high:
         reached = f"{name}: {path} = {format_table(variable)} reaches {support.interval()}"

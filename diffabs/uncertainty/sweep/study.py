@@ -8,7 +8,6 @@ time, or on which of several equal devices computes it.
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 import jax
 import numpy as np
@@ -231,7 +230,7 @@ def precision(dtype: str) -> Iterator[None]:
         yield
 
 
-def noise_key(seed: Any, i: Int) -> jax.Array:
+def noise_key(seed: Int, i: Int) -> jax.Array:
     """Return the random key for the sensors of sample i."""
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), NOISE_STREAM), i)
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -84,7 +83,7 @@ def read_correlation(table: object, where: str) -> Correlation:
     return check_sound(values.read_table(Correlation, table, where), where)
 
 
-def _read_variable(entry: object, where: str) -> Any:
+def _read_variable(entry: object, where: str) -> Distribution:
     return distributions.read_distribution(entry, where, distributions.DISTRIBUTION_TYPES | {"rows": Rows})
 
 

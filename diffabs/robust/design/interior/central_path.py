@@ -168,7 +168,7 @@ def directions(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
     return y, g
 
 
-def solve_newton_system(hessian: Matrix, right: Any) -> Matrix:
+def solve_newton_system(hessian: Matrix, right: Array) -> Matrix:
     """Return H^-1 b for a positive definite H (d, d), which is first scaled to a unit diagonal."""
     # Scaling the diagonal to 1 lowers the condition number: directions of X and F differ by many decades.
     unit = 1 / jnp.sqrt(jnp.diagonal(hessian))

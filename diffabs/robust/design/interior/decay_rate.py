@@ -19,14 +19,14 @@ Source of the method of centres: S. Boyd and L. El Ghaoui (1993).
 
 import math
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from diffabs.core.first_order import first_order
-from diffabs.core.types import AnyArray, Array, Matrix, PyTree, Scalar, Vector
+from diffabs.core.types import AnyArray, Array, Int, Matrix, PyTree, Scalar, Vector
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.robust.design.interior.central_path import (
     CENTRING_DECREMENT,
@@ -55,7 +55,7 @@ class _DecayPathState(NamedTuple):
     """
 
     steps: Scalar
-    patience: Any
+    patience: Int
     T: Matrix
     s: Scalar
     mu: Scalar
@@ -95,7 +95,7 @@ def _least_shift(discrete: bool, closed: Matrix) -> Matrix:
 
 
 @_least_shift.defjvp
-def _least_shift_jvp(discrete: bool, primals: PyTree, tangents: PyTree) -> tuple[Array, Array]:
+def _least_shift_jvp(discrete: bool, primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
     """Return s and ds = sum <W_i, dL_i(X)>/sum <W_i, X>, in the coordinates where X is the unit matrix."""
     s, T, weights = _follow_path(discrete, *primals)
     c, change = (jnp.linalg.inv(T) @ x @ T for x in (primals[0], first_order(tangents[0], NO_SECOND_DERIVATIVES)))
@@ -210,7 +210,7 @@ def _balancing_units(size: Vector) -> Matrix:
     """Return units d (n,), x = d z, that give rows and columns of `size` about equal sums without the diagonal."""
     size = size * (1 - jnp.eye(len(size)))
 
-    def sweep(_: object, d: Any) -> Matrix:
+    def sweep(_: object, d: Array) -> Matrix:
         row, column = size @ d / d, size.T @ (1 / d) * d
         # A state without coupling keeps its unit; the inner where avoids 0/0 for it.
         coupled = (row > 0) & (column > 0)

@@ -84,7 +84,7 @@ def _solve_central_path(discrete: bool, problem: GuaranteedCostProblem) -> tuple
 
 @_solve_central_path.defjvp
 def _solve_central_path_jvp(
-    discrete: bool, primals: PyTree, tangents: PyTree
+    discrete: bool, primals: tuple[Array, ...], tangents: tuple[Array, ...]
 ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
     """Return the implicit derivative: H dx + d(gradient of phi at constant x) = 0, in the coordinates of the point."""
     (problem,), (change,) = primals, tangents
