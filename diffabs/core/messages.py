@@ -124,7 +124,7 @@ class Sample(NamedTuple):
         """Return outputs and setpoint."""
         return Shown(self.output, self.setpoint)
 
-    def error_signals(self) -> Scalar:
+    def error_controlled_signals(self) -> Scalar:
         """Return the first output, whose error limits an adaptive step."""
         return self.output[0]
 

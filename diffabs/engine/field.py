@@ -130,11 +130,11 @@ class FieldSample(NamedTuple):
         """Return all of it."""
         return self
 
-    def error_signals(self) -> tuple[()]:
+    def error_controlled_signals(self) -> tuple[()]:
         """Return nothing: the states' errors alone limit a step."""
         return ()
 
-    signal_scales = error_signals
+    signal_scales = error_controlled_signals
 
 
 class FieldSignals(NamedTuple):
@@ -237,7 +237,7 @@ class FieldSystem:
         """Return the state: all are admissible."""
         return state
 
-    def error_signals(self, state: FieldState) -> tuple[()]:
+    def error_controlled_signals(self, state: FieldState) -> tuple[()]:
         """Return nothing: the states' errors alone limit a step."""
         del state
         return ()

@@ -17,7 +17,8 @@ from diffabs.core.cubic import HermiteStep
 from diffabs.core.protocols import Clock, Objective
 from diffabs.core.types import Int, PyTree, Scalar
 
-Margins = dict[str, tuple[Any, ...]]  # by name; each one of "stop" ends a run
+Margins = dict[str, tuple[Any, ...]]  # by name; "stop" is one of them, and each of its margins ends a run
+Fired = dict[str, tuple[Any, ...]]  # by the names of the margins: True for each that has fallen through zero
 Objectives = dict[str, Objective]
 Finish = Callable[[Any, Any, PyTree], tuple[Any, PyTree]]  # of system, objectives, last carry: result, last observation
 Observe = Callable[[Any, Scalar, Any, Any], PyTree]  # of system, time, state, and whether the run goes on
@@ -46,8 +47,8 @@ class HybridSample(Protocol):
         """Return the part of it whose rates most objectives need: rates of all signals cost more."""
         ...
 
-    def error_signals(self) -> PyTree:
-        """Return the signals of `HybridSystem.error_signals`."""
+    def error_controlled_signals(self) -> PyTree:
+        """Return the signals of `HybridSystem.error_controlled_signals`."""
         ...
 
     def signal_scales(self) -> PyTree:
@@ -123,13 +124,13 @@ class HybridSystem(Protocol):
         state: Any,
         before: Any,
         margins: Margins,
-        fired: Margins,
+        fired: Fired,
         passed: dict[str, HermiteStep] | None = None,
     ) -> Any:
         """Return the state after an instant, of the state, the signals `before` it, and its margins.
 
-        Where a run ends it is not called. `fired` is True for each margin that has fallen through zero. `passed` has
-        the recorded signals over the step that ends here; None at the start of a run.
+        Where a run ends it is not called. `passed` has the recorded signals over the step that ends here; None at the
+        start of a run.
         """
         ...
 
@@ -145,6 +146,6 @@ class HybridSystem(Protocol):
         """Return the state with these two parts."""
         ...
 
-    def error_signals(self, state: Any) -> PyTree:
+    def error_controlled_signals(self, state: Any) -> PyTree:
         """Return the signals whose errors limit an adaptive step, as do those of the states; () for none."""
         ...

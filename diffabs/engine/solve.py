@@ -23,7 +23,7 @@ from diffabs.engine.admission import build_field, has_tracer, read_solver, trace
 from diffabs.engine.drive.deferred import run_deferred
 from diffabs.engine.drive.engine import resolve_request
 from diffabs.engine.drive.loops import log_run, round_up_capacity
-from diffabs.engine.drive.runs import RunCapacity, run_differentiable
+from diffabs.engine.drive.runs import RunPlan, run_differentiable
 from diffabs.engine.field import COINCIDENCE_FRACTION, Event, Field, FieldSystem, Saves, SolutionStatus
 from diffabs.engine.solvers import Adaptive, Solver
 from diffabs.engine.step.adaptive import AdaptiveStepping
@@ -184,11 +184,11 @@ def solve(
     saves = {} if save_objective is None else {"saves": save_objective}
 
     room = count if isinstance(method, FixedStepping) else log_capacity(system, any_solver)
-    capacity = RunCapacity(_finish_solution, None, round_up_capacity(room))
+    plan = RunPlan(_finish_solution, None, round_up_capacity(room))
     run = system, saves, method, None
     if engine == "kernel" or (engine == "auto" and is_traced(system, saves)):
-        return run_deferred(run_differentiable, capacity, run, required=engine == "kernel")
-    return run_differentiable(capacity, run)
+        return run_deferred(run_differentiable, plan, run, required=engine == "kernel")
+    return run_differentiable(plan, run)
 
 
 @default_flags()

@@ -159,7 +159,7 @@ class Loop:
         """Return the state of `LoopState.flow` and `LoopState.memories`."""
         return LoopState(flow[0], *(Memory(*parts) for parts in zip(flow[1:], held, strict=True)))
 
-    def error_signals(self, state: LoopState) -> Scalar:
+    def error_controlled_signals(self, state: LoopState) -> Scalar:
         """Return the plant's first output."""
         return self.plant.output(state.plant)[0]
 

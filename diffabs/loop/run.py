@@ -21,7 +21,7 @@ from diffabs.core.types import Key, PyTree
 from diffabs.engine.drive.deferred import run_deferred
 from diffabs.engine.drive.engine import default_engine
 from diffabs.engine.drive.loops import round_up_capacity
-from diffabs.engine.drive.runs import RunCapacity, run_differentiable
+from diffabs.engine.drive.runs import RunPlan, run_differentiable
 from diffabs.engine.solvers import Adaptive, Solver
 from diffabs.engine.step.adaptive import AdaptiveStepping
 from diffabs.engine.step.replay import log_capacity
@@ -153,12 +153,12 @@ def run_unchecked(
     room = round_up_capacity(log_capacity(loop, solver)) if isinstance(solver, Adaptive) else between
     if every and isinstance(method, AdaptiveStepping):
         method = dataclasses.replace(method, keeps_last_step=True)
-    capacity = RunCapacity(finish_run, observe, room, round_up_capacity(count) if every else 0, every)
+    plan = RunPlan(finish_run, observe, room, round_up_capacity(count) if every else 0, every)
     # Capacities are static and rounded up, so that similar durations share one compiled program.
     arguments = loop, objectives, method, key
     if not every and engine != "xla" and is_traced(loop, objectives, key):
-        return run_deferred(run_differentiable, capacity, arguments, required=engine == "kernel")
-    run = run_differentiable(capacity, arguments)
+        return run_deferred(run_differentiable, plan, arguments, required=engine == "kernel")
+    run = run_differentiable(plan, arguments)
     return run._replace(trajectory=_truncate_trajectory(run.trajectory, count + 1)) if every else run
 
 

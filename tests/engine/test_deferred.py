@@ -238,7 +238,7 @@ def decay(start, rate):
     return d.solve(lambda t, y, a: -jnp.real(a) * y, start, 0.0, 1.0, rate, solver=d.FixedStep(0.25)).y
 
 
-@killed_by("engine.drive.deferred", "return by_xla(capacity, run)  # a kernel", "pass  # a kernel")
+@killed_by("engine.drive.deferred", "return by_xla(plan, run)  # a kernel", "pass  # a kernel")
 def test_a_complex_number_has_a_derivative():
     slope = jax.vmap(lambda z: jax.jvp(lambda z: decay(1.0, z), (z,), (1.0 + 0j,))[1])(jnp.array([0.5 + 0j, 1.0]))
     np.testing.assert_allclose(slope, -np.exp(-np.array([0.5, 1.0])), rtol=1e-3)

@@ -32,10 +32,10 @@ class Numbers(NamedTuple):
     def show(self):
         return self
 
-    def error_signals(self):
+    def error_controlled_signals(self):
         return ()
 
-    signal_scales = error_signals
+    signal_scales = error_controlled_signals
 
 
 class Signals(NamedTuple):
@@ -67,7 +67,7 @@ class System:
     def project(self, state):
         return state
 
-    def error_signals(self, state):
+    def error_controlled_signals(self, state):
         return ()
 
 

@@ -61,45 +61,45 @@ class DeferredRun(NamedTuple):
         structure: Structure of (system, objectives, method, key).
         key_kinds: For each leaf the implementation of its random key, or None for an array.
         results: Shapes and types of the leaves of the result of one run.
-        capacity: What `by_xla` needs besides the run: a hashable object with an attribute `finish`, the function that
+        plan: What `by_xla` needs besides the run: a hashable object with an attribute `finish`, the function that
             returns the result from system, objectives and the last carry.
-        by_xla: Function of the capacity and the run that returns the result by XLA, with both modes of derivatives.
+        by_xla: Function of the plan and the run that returns the result by XLA, with both modes of derivatives.
         required: True if the engine is "kernel": XLA makes none of its values and first derivatives.
     """
 
     structure: Any
     key_kinds: tuple[Any, ...]
     results: tuple[jax.ShapeDtypeStruct, ...]
-    capacity: Any
+    plan: Any
     by_xla: Callable[[Any, PyTree], PyTree]
     required: bool
 
     def call_xla(self, *leaves: Array) -> list[PyTree]:
         """Return the leaves of the run by XLA."""
-        return jax.tree.leaves(self.by_xla(self.capacity, _rebuild(self.structure, self.key_kinds, leaves)))
+        return jax.tree.leaves(self.by_xla(self.plan, _rebuild(self.structure, self.key_kinds, leaves)))
 
     def call_kernel(self, *leaves: Array) -> list[PyTree]:
         """Return the leaves of the run by a kernel; `Unsupported` or `NoCompiler` if that is impossible."""
         from diffabs.engine.drive.kernel import run_single  # `import diffabs` must not need the compiler
 
         hybrid, objectives, method, key = _rebuild(self.structure, self.key_kinds, leaves)
-        return jax.tree.leaves(run_single(hybrid, objectives, method, self.capacity.finish, key))
+        return jax.tree.leaves(run_single(hybrid, objectives, method, self.plan.finish, key))
 
 
-def run_deferred(by_xla: Callable[[Any, PyTree], PyTree], capacity: Any, run: PyTree, required: bool = False) -> PyTree:
-    """Return by_xla(capacity, run), or the same result by a kernel; the arguments are those of `DeferredRun`.
+def run_deferred(by_xla: Callable[[Any, PyTree], PyTree], plan: Any, run: PyTree, required: bool = False) -> PyTree:
+    """Return by_xla(plan, run), or the same result by a kernel; the arguments are those of `DeferredRun`.
 
     A kernel that is `required` and impossible is an EngineError at the time at which XLA compiles the program.
     """
     leaves, structure = jax.tree.flatten(run)
     if any(jnp.issubdtype(getattr(x, "dtype", float), jnp.complexfloating) for x in leaves):
-        return by_xla(capacity, run)  # a kernel has real numbers, and unit tangents are real
+        return by_xla(plan, run)  # a kernel has real numbers, and unit tangents are real
     is_key = [jnp.issubdtype(getattr(x, "dtype", float), jax.dtypes.prng_key) for x in leaves]
     kinds = tuple(jax.random.key_impl(x) if on else None for x, on in zip(leaves, is_key, strict=True))
     words = [jax.random.key_data(x) if on else jnp.asarray(x) for x, on in zip(leaves, is_key, strict=True)]
     words = _vary_alike(words)
-    result = _result_shape(structure, kinds, capacity.finish, tuple(map(_type, words)))
-    deferred = DeferredRun(structure, kinds, tuple(jax.tree.leaves(result)), capacity, by_xla, required)
+    result = _result_shape(structure, kinds, plan.finish, tuple(map(_type, words)))
+    deferred = DeferredRun(structure, kinds, tuple(jax.tree.leaves(result)), plan, by_xla, required)
     return jax.tree.unflatten(jax.tree.structure(result), _Call(deferred, ()).bind(*words))
 
 

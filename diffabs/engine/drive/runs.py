@@ -3,7 +3,7 @@
     values          a while loop (`loops.run_to_end`)
     derivatives     fixed steps: a checkpointed scan. Adaptive steps: a logged run for values, replayed (`step.replay`)
 
-What becomes of the last state is the client's: `RunCapacity.finish` and `RunCapacity.observe`.
+What becomes of the last state is the client's: `RunPlan.finish` and `RunPlan.observe`.
 """
 
 import dataclasses
@@ -41,12 +41,12 @@ from diffabs.engine.step.slides import has_slid, slide_of
 from diffabs.engine.step.status import end_unfinished
 
 
-class RunCapacity(NamedTuple):
+class RunPlan(NamedTuple):
     """What is fixed at compilation: what a client makes of a run, and for how many steps and instants there is room.
 
     Attributes:
         finish: Function that returns the result from system, objectives and the last carry, and the last observation.
-            The result of a run with a trajectory has a field for it.
+            The result of a run with a trajectory has the fields `trajectory` and `diverged`.
         observe: Function that returns an observation from system, time, state, and whether the run goes on: a pytree
             with an attribute `running`; None if no run has a trajectory.
         room: Capacity for attempts in the whole run with adaptive steps. With fixed steps for steps of the grid: in the
@@ -80,8 +80,8 @@ def run_system(
     Args:
         system: The system, a pytree whose leaves are arrays of one type.
         solver: Steps and duration [s].
-        finish: Function of system, objectives and the last `Carry`, such as `lambda system, objectives, carry:
-            (carry.point.state, None)`. It must be the same function in each call: the program is compiled for it.
+        finish: Function of system, objectives and the last `Carry` that returns the result and None, such as
+            (carry.point.state, None). A function of a module: the program is compiled for it, again for a new lambda.
         objectives: Objectives by name, whose accumulators the carry has.
         key: Random key, which `HybridSystem.change` reads.
 
@@ -91,36 +91,36 @@ def run_system(
     """
     method = build_stepping(solver, jax.tree.leaves(system)[0].dtype)
     room = log_capacity(system, solver) if isinstance(solver, Adaptive) else solver.steps
-    capacity = RunCapacity(finish, None, round_up_capacity(room))
-    return run_differentiable(capacity, (system, objectives or {}, method, key))
+    plan = RunPlan(finish, None, round_up_capacity(room))
+    return run_differentiable(plan, (system, objectives or {}, method, key))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def run_differentiable(capacity: RunCapacity, run: tuple[PyTree, ...]) -> PyTree:
-    """Return the run of (system, objectives, method, key), as `capacity.finish` makes it of the last carry."""
-    hybrid, objectives, method, key = run
-    every, static = jax.device_put(capacity.every), capacity._replace(room=0, every=0)
-    return _vary_together(_run(hybrid, objectives, method, key, every, capacity=static))
+def run_differentiable(plan: RunPlan, inputs: tuple[PyTree, ...]) -> PyTree:
+    """Return the run of (system, objectives, method, key), as `plan.finish` makes it of the last carry."""
+    hybrid, objectives, method, key = inputs
+    every, static = jax.device_put(plan.every), plan._replace(room=0, every=0)
+    return _vary_together(_run(hybrid, objectives, method, key, every, plan=static))
 
 
-def _vary_together(run: PyTree) -> PyTree:
-    """Return the run, all of whose results have the axis of `jax.vmap` if one has it.
+def _vary_together(result: PyTree) -> PyTree:
+    """Return the result of a run, all of whose arrays have the axis of `jax.vmap` if one has it.
 
     Under `jax.vmap` JAX takes the axes of a custom derivative's results from the values' run where it stages them, and
     from the derivative's run where it differentiates. A constant signal of a trajectory has it only there.
     """
-    if getattr(run, "trajectory", None) is None:
-        return run
-    return jax.tree.map(lambda x: jnp.where(run.diverged, x, x), run)
+    if getattr(result, "trajectory", None) is None:
+        return result
+    return jax.tree.map(lambda x: jnp.where(result.diverged, x, x), result)
 
 
-def _rule(capacity: RunCapacity, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
+def _rule(plan: RunPlan, primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
     hybrid, objectives, method, _ = primals[0]
     refuse_derivative(hybrid, objectives, method)
     paths = differentiated_paths(tangents[0][0])
 
-    def reversible(run: tuple[PyTree, ...]) -> PyTree:
-        return _vary_together(_run_reversible(prepare_derivatives(run[0], paths), *run[1:], capacity=capacity))
+    def reversible(inputs: tuple[PyTree, ...]) -> PyTree:
+        return _vary_together(_run_reversible(prepare_derivatives(inputs[0], paths), *inputs[1:], plan=plan))
 
     return jvp_nonzero(reversible, primals, tangents, once=_second_derivative_objection(hybrid, method))
 
@@ -137,38 +137,36 @@ def _second_derivative_objection(hybrid: HybridSystem, method: object) -> str:
 run_differentiable.defjvp(_rule, symbolic_zeros=True)
 
 
-@compile_once(static=("capacity",), options=SAME_RESULT_OPTIONS)
+@compile_once(static=("plan",), options=SAME_RESULT_OPTIONS)
 def _run(
-    hybrid: HybridSystem, objectives: Objectives, method: PyTree, key: Key, every: Int, *, capacity: RunCapacity
+    hybrid: HybridSystem, objectives: Objectives, method: PyTree, key: Key, every: Any, *, plan: RunPlan
 ) -> PyTree:
-    """Return a run for values, with capacity for the instants of a trajectory."""
+    """Return a run for values, with room for the instants of a trajectory."""
     hybrid, objectives, stepped = _prepare_run(hybrid, objectives, method, key)
-    carry, renew, instants = method.start(hybrid, objectives, key), partial(method.renew, hybrid), capacity.instants
+    carry, renew, instants = method.start(hybrid, objectives, key), partial(method.renew, hybrid), plan.instants
     if not instants:
-        return capacity.finish(hybrid, objectives, run_to_end(stepped, renew, carry))[0]
-    look, count = _observer(hybrid, method, capacity), -(-method.steps // every)
+        return plan.finish(hybrid, objectives, run_to_end(stepped, renew, carry))[0]
+    look, count = _observer(hybrid, method, plan), -(-method.steps // every)
     first = look(carry, 0)
     carry, trajectory = run_with_trajectory(stepped, renew, method.is_active, look, carry, every, count, instants)
-    return _attach_trajectory(capacity.finish(hybrid, objectives, carry), first, trajectory)
+    return _attach_trajectory(plan.finish(hybrid, objectives, carry), first, trajectory)
 
 
-def _observer(hybrid: HybridSystem, method: PyTree, capacity: RunCapacity) -> Callable[[PyTree, Any], PyTree]:
+def _observer(hybrid: HybridSystem, method: PyTree, plan: RunPlan) -> Callable[[PyTree, Any], PyTree]:
     """Return a function of the carry and an instant of the grid that returns the observation there."""
-    observe = capacity.observe
+    observe = plan.observe
     assert observe is not None
     return lambda carry, instant: observe(hybrid, *method.state_at(carry, instant))
 
 
-@partial(jax.jit, static_argnames="capacity")
-def _run_reversible(
-    hybrid: HybridSystem, objectives: Objectives, method: PyTree, key: Key, *, capacity: RunCapacity
-) -> PyTree:
+@partial(jax.jit, static_argnames="plan")
+def _run_reversible(hybrid: HybridSystem, objectives: Objectives, method: PyTree, key: Key, *, plan: RunPlan) -> PyTree:
     """Return a run for derivatives in both modes."""
     if isinstance(method, AdaptiveStepping):
-        return _run_by_replay(hybrid, objectives, method.for_replay(), key, capacity)
+        return _run_by_replay(hybrid, objectives, method.for_replay(), key, plan)
     method = method.for_derivatives()
     hybrid, objectives, stepped = _prepare_run(hybrid, objectives, method, key)
-    carry, (finish, _, room, instants, every) = method.start(hybrid, objectives, key), capacity
+    carry, (finish, _, room, instants, every) = method.start(hybrid, objectives, key), plan
 
     def attempts(steps: int) -> int:
         return round_up_capacity(method.capacity(hybrid, steps))
@@ -177,7 +175,7 @@ def _run_reversible(
         # A run that needs more attempts than there is room for is still running: `end_unfinished`.
         carry = scan_steps(stepped, method.is_active, carry, 0, None, room, attempts)
         return finish(hybrid, objectives, end_unfinished(carry))[0]
-    look, count = _observer(hybrid, method, capacity), -(-method.steps // every)
+    look, count = _observer(hybrid, method, plan), -(-method.steps // every)
     first = look(carry, 0)
     carry, trajectory = scan_with_trajectory(stepped, method.is_active, look, carry, every, count, instants, attempts)
     judged, slides = finish(hybrid, objectives, end_unfinished(carry)), has_slid(slide_of(carry))
@@ -185,11 +183,11 @@ def _run_reversible(
 
 
 def _run_by_replay(
-    hybrid: HybridSystem, objectives: Objectives, live: AdaptiveStepping, key: Key, capacity: RunCapacity
+    hybrid: HybridSystem, objectives: Objectives, live: AdaptiveStepping, key: Key, plan: RunPlan
 ) -> PyTree:
     """Return a run with adaptive steps for derivatives in both modes: logged for its values, then replayed."""
     hybrid, further = hybrid.prepare_run()
-    objectives, (finish, observe, room, instants, every) = {**objectives, **further}, capacity
+    objectives, (finish, observe, room, instants, every) = {**objectives, **further}, plan
     # The log holds values only: derivatives come from the replay.
     still, measures = jax.tree.map(jax.lax.stop_gradient, (hybrid, objectives))
     logged = dataclasses.replace(live, keeps_last_step=False)

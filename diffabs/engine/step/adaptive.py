@@ -120,7 +120,7 @@ class AdaptiveControl(NamedTuple):
     Attributes:
         error_limited: Length that the error allows [s].
         limit: Longest stable step [s].
-        scale: Largest values of the `error_signals` and of the states so far, as `error_scales` returns them.
+        scale: Largest values so far of what limits the error, as `error_scales` returns them.
         tries: Number of attempts so far.
         tries_at_renewal: Number of attempts at the last update of the stability limit.
         last_step: Last step, a `StateSpan`; () without a trajectory.
@@ -148,7 +148,7 @@ class AdaptiveReport(NamedTuple):
 
     Attributes:
         error: Error as a multiple of the allowed error.
-        scale: Largest values of the `error_signals` and of the states so far, as `error_scales` returns them.
+        scale: Largest values so far of what limits the error, as `error_scales` returns them.
         past_crossing: Time from the first change of a comparison inside the step, or the first turn of a margin beyond
             zero, to the end of the step [s]; 0 without one.
         grazes: True if a margin only touches zero, or crosses it twice in a step that is too short to be cut.

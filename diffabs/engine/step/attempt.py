@@ -4,8 +4,8 @@
                    the end, and updates the objectives over the step
     commit_step    lets the events and ticks of the blocks happen at the end of an accepted step
 
-Nothing else integrates, projects or accumulates, and nothing else changes a block. What chooses the steps is a
-`Stepping` (`advance`).
+After t = 0 nothing else integrates, projects or accumulates, and nothing else changes what a state holds. What chooses
+the steps is a `Stepping` (`advance`).
 """
 
 from collections.abc import Callable

@@ -29,20 +29,22 @@ MIN_CROSSING_STEP_FRACTION = 4e-3  # fraction of the length that the error allow
 
 
 def error_scales(state: HybridState, sample: HybridSample) -> PyTree:
-    """Return the scales of the error: the sizes of the `error_signals` and of every state."""
+    """Return the scales of the error: the sizes of the `error_controlled_signals` and of every state."""
     return sample.signal_scales(), jax.tree.map(jnp.abs, state.flow())
 
 
 def error_norm(
     hybrid: HybridSystem, state: HybridState, state_errors: Scalar, scale: Scalar, sample: HybridSample
 ) -> Array:
-    """Return the greatest error of all states and of the `error_signals`, as a fraction of their scales.
+    """Return the greatest error of all states and of the `error_controlled_signals`, as a fraction of their scales.
 
     The errors of the states lie in the middle of the step. The signals are evaluated with them at the end of the
     step, as an approximation.
     """
     moved = state.with_flow(jax.tree.map(lambda x, d: x - d, state.flow(), state_errors))
-    signal_errors = jax.tree.map(jnp.subtract, hybrid.error_signals(moved), sample.error_signals())
+    signal_errors = jax.tree.map(
+        jnp.subtract, hybrid.error_controlled_signals(moved), sample.error_controlled_signals()
+    )
     pairs = zip(jax.tree.leaves((signal_errors, state_errors)), jax.tree.leaves(scale), strict=True)
     shares = [jnp.max(jnp.abs(d) / jnp.where(c > 0, c, 1.0)) for d, c in pairs if jnp.size(c)]
     return jnp.max(jnp.stack(shares or [jnp.asarray(0.0)]))
