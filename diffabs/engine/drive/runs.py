@@ -21,7 +21,7 @@ from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once, is_traced
 from diffabs.core.numerics import void_derivatives
 from diffabs.core.pytree import prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero
-from diffabs.core.types import Array, Int, Key, PyTree, Scalar
+from diffabs.core.types import Array, Key, PyTree, Scalar
 from diffabs.engine.drive.loops import (
     Step,
     log_run,
