@@ -25,7 +25,7 @@ def staged():
     return program, jax.jvp(program, (MASS,), (jnp.ones_like(MASS),))[1][0]
 
 
-@killed_by("engine.drive.runs", 'if getattr(run, "trajectory", None) is None:', "if True:")
+@killed_by("engine.drive.runs", 'if getattr(result, "trajectory", None) is None:', "if True:")
 def test_a_staged_batch_can_be_differentiated():
     program = jex.jaxpr_as_fun(jax.make_jaxpr(slips)(MASS))
     (slope,) = jax.eval_shape(lambda mass: jax.jvp(program, (mass,), (jnp.ones_like(mass),))[1], MASS)
