@@ -18,7 +18,7 @@ condition up to its next event and makes its sign agree.
 import dataclasses
 import enum
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -196,7 +196,9 @@ class FieldSystem:
     """The functions."""
     times_per_event: int = static()
     """Number of times that are kept of each event."""
-    ticks, jumps, recorders = False, True, ()
+    ticks: ClassVar[bool] = False
+    jumps: ClassVar[bool] = True
+    recorders: ClassVar[tuple[str, ...]] = ()
 
     @property
     def span(self) -> Scalar:

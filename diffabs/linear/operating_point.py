@@ -18,13 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from diffabs.core.blocks import Direct, NoFeedforward
 from diffabs.core.jax_flags import default_flags
-from diffabs.core.protocols import Block, Feedforward, Memory, Plant, Reference, Tracking
-from diffabs.core.pytree import canonical_dtypes, part, pytree, static
+from diffabs.core.protocols import Memory, Tracking
+from diffabs.core.pytree import canonical_dtypes, pytree, static
 from diffabs.core.types import AnyArray, Array, Bool, Matrix, Part, PyTree, Scalar
 from diffabs.linear.linearization import StateSpace, check_kink, is_kinked, nan_at_kink
-from diffabs.loop.closed_loop import Loop
+from diffabs.loop.closed_loop import Loop, LoopParts
 from diffabs.parts.stops import NoStop
 
 ROOT_ITERATIONS = 10  # Gauss-Newton iterations to the point of rest; one is enough where the loop is linear
@@ -50,16 +49,9 @@ class LinearLoop(NamedTuple):
 
 
 @pytree
-class OperatingPoint:
+class OperatingPoint(LoopParts):
     """A loop at rest, as a linear model in continuous time. `operating_point` makes it."""
 
-    plant: Plant = part()
-    initial: Part = part()
-    sensor: Block = part(default=Direct)
-    reference: Reference = part()
-    feedforward: Feedforward = part(default=NoFeedforward)
-    controller: Block = part()
-    actuator: Block = part(default=Direct)
     indices: tuple[int, ...] = static(default=())
     """Indices of the loop's states that the model contains."""
 

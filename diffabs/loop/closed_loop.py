@@ -83,8 +83,8 @@ RESERVED_SIGNALS = {*LOOP_SIGNALS, "t", "time", "sample", "metrics", "units"}
 
 
 @pytree
-class Loop:
-    """A closed loop of plant and controller with the blocks around them."""
+class LoopParts:
+    """The parts of a closed loop, without what ends its run."""
 
     plant: Plant = part()
     initial: Part = part()
@@ -93,6 +93,12 @@ class Loop:
     feedforward: Feedforward = part(default=NoFeedforward)
     controller: Block = part()
     actuator: Block = part(default=Direct)
+
+
+@pytree
+class Loop(LoopParts):
+    """A closed loop of plant and controller with the blocks around them."""
+
     stop: Stop = part()
 
     def _repr_html_(self) -> str:
