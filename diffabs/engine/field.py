@@ -18,7 +18,7 @@ condition up to its next event and makes its sign agree.
 import dataclasses
 import enum
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -196,9 +196,21 @@ class FieldSystem:
     """The functions."""
     times_per_event: int = static()
     """Number of times that are kept of each event."""
-    ticks: ClassVar[bool] = False
-    jumps: ClassVar[bool] = True
-    recorders: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def ticks(self) -> bool:
+        """Whether there is a clock: no."""
+        return False
+
+    @property
+    def jumps(self) -> bool:
+        """Whether a rate may jump where a comparison changes: yes."""
+        return True
+
+    @property
+    def recorders(self) -> tuple[str, ...]:
+        """Names of the recorded signals: none."""
+        return ()
 
     @property
     def span(self) -> Scalar:
