@@ -29,9 +29,11 @@ os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("DIFFABS_JAX_CACHE", CA
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"  # programs without the lines of Python that each operation is from
 
-# A background job ignores SIGINT, and so would the processes that tests interrupt.
+# A background job ignores SIGINT, and one under nohup SIGHUP. So would the processes that tests interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 gc.disable()  # until all is imported: what imports make stays, and looking through it took a fourth of the time
 
