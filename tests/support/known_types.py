@@ -5,18 +5,21 @@ python tests/support/known_types.py --store     stores share and symbols, if the
 """
 
 import json
+import os
 import pathlib
 import subprocess
 import sys
 
 STORED = pathlib.Path(__file__).with_suffix(".json")
 COMMAND = [sys.executable, "-m", "pyright", "--verifytypes", "diffabs", "--ignoreexternal", "--outputjson"]
+# pyright reads the packages of the first Python of PATH.
+ENVIRONMENT = os.environ | {"PATH": os.pathsep.join([str(pathlib.Path(sys.executable).parent), os.environ["PATH"]])}
 DIGITS = 4
 
 
 def measure() -> tuple[float, list[str]]:
     """Return the share of public symbols with a known type, and the names of the others."""
-    report = subprocess.run(COMMAND, capture_output=True, text=True, check=False)
+    report = subprocess.run(COMMAND, env=ENVIRONMENT, capture_output=True, text=True, check=False)
     types = json.loads(report.stdout)["typeCompleteness"]
     untyped = {symbol["name"] for symbol in types["symbols"] if symbol["isExported"] and not symbol["isTypeKnown"]}
     return round(types["completenessScore"], DIGITS), sorted(untyped)
