@@ -39,7 +39,6 @@ import numpy as np
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.kinds import find_value_objection, format_value
 from diffabs.core.shapes import Bool, Float, Int
-from diffabs.core.types import Scalar
 from diffabs.uncertainty.reliability.importance_sampling import (
     CountedScore,
     Gradient,
@@ -288,7 +287,7 @@ def _check_integer(name: str, value: object, minimum: int) -> None:
         raise ValueError(f"{name} = {value} is outside [{minimum}, inf)")
 
 
-def check_number(name: str, value: Scalar, unit: str = "1") -> None:
+def check_number(name: str, value: object, unit: str = "1") -> None:
     """Check that a setting is one finite number."""
     allowed = f"(-inf, inf) {'' if unit == '1' else unit}".rstrip()
     if line := find_value_objection(value) or ("is no single number" if np.ndim(value) else ""):
