@@ -32,7 +32,7 @@ import dataclasses
 import enum
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -287,7 +287,7 @@ def _check_integer(name: str, value: object, minimum: int) -> None:
         raise ValueError(f"{name} = {value} is outside [{minimum}, inf)")
 
 
-def check_number(name: str, value: object, unit: str = "1") -> None:
+def check_number(name: str, value: Any, unit: str = "1") -> None:
     """Check that a setting is one finite number."""
     allowed = f"(-inf, inf) {'' if unit == '1' else unit}".rstrip()
     if line := find_value_objection(value) or ("is no single number" if np.ndim(value) else ""):
