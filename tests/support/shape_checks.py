@@ -1,8 +1,12 @@
 """Checks of shapes: beartype reads those annotations that name shapes, in the process of a test.
 
 JAX calls the constructors of records with tracers and placeholders when it rebuilds them; these are not checked.
+A check takes longer than many of the functions, so only the first calls of each are checked.
 """
 
+import functools
+import inspect
+import itertools
 from collections.abc import Callable
 from typing import Any, get_args
 
@@ -11,6 +15,9 @@ from beartype import BeartypeConf, beartype
 from project import ROOT
 
 CHECK = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float
+CHECKED_CALLS = 50  # of each function in a process
+
+_jaxtyped = jaxtyping.jaxtyped
 
 
 def has_shape(hint: Any) -> bool:
@@ -26,6 +33,24 @@ def check_shapes(function: Callable[..., Any]) -> Callable[..., Any]:
     return CHECK(function) if function.__annotations__ else function
 
 
+def check_first_calls(function: Any = None, *, typechecker: Any = None) -> Any:
+    """Stand for `jaxtyping.jaxtyped`: a function without shapes stays as it is, another is checked at first."""
+    if function is None:
+        return functools.partial(check_first_calls, typechecker=typechecker)
+    checked = _jaxtyped(function, typechecker=typechecker)
+    if not inspect.isfunction(function):
+        return checked
+    if not any(map(has_shape, function.__annotations__.values())):
+        return function
+    calls = itertools.count()
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        return (checked if next(calls) < CHECKED_CALLS else function)(*args, **options)
+
+    return call
+
+
 def modules_with_shapes() -> list[str]:
     """Return the names of the modules that import names of shapes."""
     files = sorted((ROOT / "diffabs").rglob("*.py"))
@@ -35,4 +60,5 @@ def modules_with_shapes() -> list[str]:
 
 def install() -> None:
     """Check the shapes in this process; call it before the package is imported."""
+    jaxtyping.jaxtyped = check_first_calls  # the name that the hook writes
     jaxtyping.install_import_hook(modules_with_shapes(), "shape_checks.check_shapes")
