@@ -15,10 +15,11 @@ from typing import Any, NoReturn
 
 from diffabs.core.types import JsonObject
 from diffabs.host import files
+from diffabs.host.values import format_given
 
 VERSION = 1  # of the documents that this release writes; it reads this version, earlier ones, and documents without any
 MAX_DOCUMENT_BYTES = 2**27  # bytes of a document that is read
-FORMAT_PATTERN = re.compile(r"diffabs ([a-z -]+) ([0-9]{1,9})")
+FORMAT_PATTERN = re.compile(r"diffabs ([a-z -]+) ([0-9]{1,4000})")  # Python reads no integer of more than 4300 digits
 
 
 class DocumentError(ValueError):
@@ -39,15 +40,28 @@ def kind_of(content: object) -> str:
     """Return the kind of a document; empty without a format of this package.
 
     Raises:
-        DocumentError: The document is of a later version than this release reads.
+        DocumentError: The document is of a version that this release does not read.
     """
     stated = content.get("format") if isinstance(content, dict) else None
     match = FORMAT_PATTERN.fullmatch(stated) if isinstance(stated, str) else None
     if match is None:
         return ""
-    if int(match[2]) > VERSION:
-        raise DocumentError(f"{stated} is newer than version {VERSION}, the last that this release of diffabs reads")
+    version = int(match[2])
+    if not 1 <= version <= VERSION:
+        raise other_release_error(stated, version, VERSION)
     return match[1]
+
+
+def other_release_error(stated: object, version: float, needed: int) -> DocumentError:
+    """Return the error for a file whose `format` states a version that this release does not read.
+
+    Args:
+        stated: Value of `format`.
+        version: Version in it.
+        needed: Version that this release reads.
+    """
+    age = "a newer" if version > needed else "an older"
+    return DocumentError(f"format = {format_given(stated)} was written by {age} diffabs; version {needed} is needed")
 
 
 def format_document(content: object, indent: int | None = 2) -> str:
@@ -82,7 +96,7 @@ def read_document(path: str | os.PathLike[str], max_bytes: int = MAX_DOCUMENT_BY
 
     Raises:
         OSError: The file cannot be read.
-        DocumentError: It is of a later version, or has an integer beyond the range of a float.
+        DocumentError: It is of another version, or has an integer beyond the range of a float.
         ValueError: It is too large, no JSON in UTF-8, or nested too deeply.
     """
     return parse_document(files.read_content(path, max_bytes), exact=exact)

@@ -23,7 +23,7 @@ from diffabs.host import documents, files
 from diffabs.loop.closed_loop import Loop
 from diffabs.parts.objectives import default_objectives
 from diffabs.robust.design.verify import MAX_SECONDS, ClaimVerdict, verify_file
-from diffabs.robust.reach.certificate import certificate_document
+from diffabs.robust.reach.certificate import FORMAT, certificate_document
 from diffabs.robust.reach.cover import BoxProof, RunClaim, cover_box
 from diffabs.robust.reach.equations import derive_equations
 from diffabs.robust.reach.extremes import ExtremeRuns, find_extreme_runs
@@ -272,7 +272,7 @@ def read_proof_document(path: str | os.PathLike[str]) -> JsonObject | None:
     """Return the content of a file that `Proof.save` wrote, None for any other file.
 
     Raises:
-        DocumentError: The file is of a later version than this release reads.
+        DocumentError: The file is of a version that this release does not read, or a document of another kind.
     """
     try:
         document = documents.read_document(path, MAX_PROOF_BYTES)
@@ -280,8 +280,12 @@ def read_proof_document(path: str | os.PathLike[str]) -> JsonObject | None:
         raise
     except (OSError, ValueError):
         return None
-    is_proof = isinstance(document, dict) and str(document.get("format", "")).startswith(f"diffabs {BOX_PROOF}")
-    return document if is_proof else None
+    kind = documents.kind_of(document)
+    if kind not in ("", BOX_PROOF):
+        raise documents.DocumentError(
+            f'format = "{document["format"]}" is no proof; "{FORMAT}" or "diffabs certificate" is needed'
+        )
+    return document if kind else None
 
 
 def _verify_box_file(document: JsonObject, name: str, share: float, progress: Progress, processes: int) -> Verification:

@@ -455,6 +455,7 @@ def test_an_unstable_loop_is_not_called_proved(period, kind, data, tmp_path, cap
         (("claims", 0, "data"), []),
         (("format",), "none"),
         (("version",), 2),
+        (("version",), True),
     ],
 )
 def test_a_claim_about_nothing_is_not_called_proved(keys, value, tmp_path, capsys):
@@ -665,6 +666,7 @@ def edited(path, *keys, to):
     [
         (("format",), "other", "format"),
         (("version",), 2, "version"),
+        (("version",), True, "version"),
         (("extra",), 1, "extra"),
         (("system",), [], "system"),
         (("system",), {"cells": []}, "system"),

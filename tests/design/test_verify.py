@@ -169,7 +169,7 @@ FALSE = [
     ({**document(), "claims": []}, 1, "the file has no claims"),
     ({}, 2, "the file must have the members format, version, system, gain, claims and no other"),
     ([], 2, "the file must have the members"),
-    ({**document(), "version": 2}, 2, "format and version"),
+    ({**document(), "version": 2}, 2, "version = 2.0; 1.0 is needed"),
 ]
 
 

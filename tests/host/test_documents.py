@@ -20,14 +20,16 @@ from diffabs.host.documents import (
 from diffabs.output.report import find_documents
 
 
-@killed_by("host.documents", "if int(match[2]) > VERSION:", "if False:")
+@killed_by("host.documents", "if not 1 <= version <= VERSION:", "if version > VERSION:")
+@killed_by("host.documents", "if not 1 <= version <= VERSION:", "if version < 1:")
 def test_a_document_has_a_kind_and_a_version(tmp_path: pathlib.Path) -> None:
     document = stamp("tune", {"free": {}})
     assert document == {"format": "diffabs tune 1", "free": {}}
     (tmp_path / "x.json").write_text(format_document(document))
     assert kind_of(read_document(tmp_path / "x.json")) == "tune"
-    with pytest.raises(DocumentError, match="diffabs tune 2 is newer than version 1"):
-        parse_document('{"format": "diffabs tune 2"}')
+    for version, age in ((2, "a newer"), (10**11, "a newer"), (10**3999, "a newer"), (0, "an older")):
+        with pytest.raises(DocumentError, match=f"^format = .* was written by {age} diffabs; version 1 is needed$"):
+            parse_document(f'{{"format": "diffabs tune {version}"}}')
 
 
 @pytest.mark.parametrize("content", [{}, [], 3, {"format": 3}, {"format": "diffabs certificate"}, {"format": "tune 1"}])

@@ -361,7 +361,7 @@ def test_the_file_of_a_document_is_no_option_of_a_command(results, tmp_path):
 def test_lists_in_lists_are_one_line(results, tmp_path):
     invented_sweep(tmp_path / "s", {"type": "random"})
     (tmp_path / "s" / "manifest.json").write_text("[" * 100_000)
-    with pytest.raises(ReportError, match="cannot be read as a document of sweep: ValueError nested too deeply"):
+    with pytest.raises(ReportError, match=r"a document of sweep: .*manifest\.json: nested too deeply$"):
         build_report(find_documents(tmp_path / "s"))
     deep = '"evaluations": ' + "[" * 800 + "]" * 800 + ', "x": '
     (tmp_path / "x.json").write_text((results / "tune.json").read_text().replace('"evaluations": ', deep, 1))
@@ -500,6 +500,7 @@ def test_commands_of_a_report_can_be_pasted(results, tmp_path):
 
 
 @killed_by("output.report.documents", 'content.get("format", CERTIFICATE_FORMAT) == CERTIFICATE_FORMAT', "True")
+@killed_by("output.report.documents", '    if kinds != ["sweep"]:', "    if False:")
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -513,7 +514,26 @@ def test_commands_of_a_report_can_be_pasted(results, tmp_path):
         ),
         ({"x.json": '{"papers": 3}', "y.json": "[" * 100_000}, "has no document"),
         ({"x.json": '{"format": "of others", "system": {}, "claims": []}'}, "has no document"),
-        ({"x.json": '{"format": "diffabs tune 2"}'}, "diffabs tune 2 is newer than version 1"),
+        (
+            {"x.json": '{"format": "diffabs tune 2"}'},
+            'format = "diffabs tune 2" was written by a newer diffabs; version 1 is needed',
+        ),
+        ({"x.json": '{"format": "diffabs design 0"}'}, "was written by an older diffabs; version 1 is needed"),
+        ({"x.json": '{"format": "diffabs design 99999999999"}'}, "was written by a newer diffabs; version 1 is needed"),
+        (
+            {"manifest.json": '{"format": 4}', "summary.json": json.dumps(SWEEP_KEYS)},
+            "manifest.json: format = 4 was written by a newer diffabs; version 3 is needed",
+        ),
+        ({"manifest.json": "{}", "summary.json": ""}, "summary.json: is empty; diffabs sweep ... --resume writes it"),
+        ({"manifest.json": "{}", "summary.json": "[1]"}, "summary.json: is not a document that reproduce, sweep"),
+        (
+            {"manifest.json": "{}", "summary.json": '{"free": {}, "history": [], "constraints": []}'},
+            "summary.json: is of tune, and a document of sweep is needed; diffabs sweep ... --resume writes it again",
+        ),
+        (
+            {"x.json": '{"format": "diffabs certificate", "version": true, "system": {}, "gain": [], "claims": []}'},
+            "cannot be read as a document of certificate: version = true; 1.0 is needed",
+        ),
     ],
 )
 def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, words):
@@ -526,6 +546,27 @@ def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, words):
     assert words in result.stderr
     assert_one_error_line(result)
     assert not (folder / "report.html").exists()
+
+
+@killed_by("output.report.writing", "        check_tables(document)\n", "")
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("over", [], "over = [] is a list; a table is needed"),
+        ("made", [1], "made = [1] is a list; a table is needed"),
+        ("model", None, "model = None is nothing; a table is needed"),
+        ("model.parameters", "x", 'model.parameters = "x" is text; a table is needed'),
+        ("neglected", 3, "a value in it is of the wrong type"),
+    ],
+)
+def test_a_member_of_another_type_is_one_line(results, tmp_path, path, value, words):
+    content = json.loads((results / "design.json").read_text())
+    parent, _, name = path.rpartition(".")
+    (content[parent] if parent else content)[name] = value
+    (tmp_path / "x.json").write_text(json.dumps(content))
+    result = command("report", tmp_path / "x.json", status=2)
+    assert result.stderr.endswith(f"x.json: cannot be read as a document of design: {words}\n")
+    assert_one_error_line(result)
 
 
 @killed_by("output.report.documents", "if named and not documents:", "if False:")

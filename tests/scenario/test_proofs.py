@@ -57,7 +57,16 @@ def test_a_saved_proof_has_its_loop_and_is_verified(proof: Proof, tmp_path: path
 @killed_by("scenario.proofs", "    except documents.DocumentError:\n        raise\n", "")
 def test_a_proof_of_a_later_release_is_named(tmp_path: pathlib.Path) -> None:
     (tmp_path / "p.json").write_text(json.dumps({"format": "diffabs box proof 2"}))
-    with pytest.raises(DocumentError, match="diffabs box proof 2 is newer"):
+    with pytest.raises(DocumentError, match='"diffabs box proof 2" was written by a newer diffabs'):
+        verify(tmp_path / "p.json")
+
+
+@killed_by("scenario.proofs", 'if kind not in ("", BOX_PROOF):', "if False:")
+@pytest.mark.parametrize("kind", ["box proofs", "tune"])
+def test_a_document_of_another_kind_is_no_proof(kind: str, tmp_path: pathlib.Path) -> None:
+    (tmp_path / "p.json").write_text(json.dumps({"format": f"diffabs {kind} 1", "verdict": "proved"}))
+    needed = f'^format = "diffabs {kind} 1" is no proof; "diffabs box proof 1" or "diffabs certificate" is needed$'
+    with pytest.raises(DocumentError, match=needed):
         verify(tmp_path / "p.json")
 
 

@@ -25,7 +25,7 @@ def check(document):
     """What is not proved of a JSON document, a line for each such claim; nothing if all is. Raises ValueError for what
     is no certificate. Numbers are floats, as in the file: of a whole one, too (`parse_int=float`)."""
     given = members(document, "the file", {"format", "version", "system", "gain", "claims"})
-    if given["format"] != "diffabs certificate" or given["version"] != 1:
+    if given["format"] != "diffabs certificate" or given["version"] != 1 or given["version"] is True:
         raise ValueError("format and version are not 'diffabs certificate' and 1")
     if not isinstance(given["claims"], list):
         raise ValueError("the claims are not a list")

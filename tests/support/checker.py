@@ -213,7 +213,7 @@ def main(path):
     try:
         with open(path, encoding="utf-8") as file:
             stored, good = json.load(file, parse_int=float), []
-        if (stored["format"], stored["version"]) != ("diffabs certificate", 1):
+        if (stored["format"], stored["version"]) != ("diffabs certificate", 1) or stored["version"] is True:
             raise ValueError("format and version are not 'diffabs certificate' and 1")
         for claim in stored["claims"]:
             good.append(proved(stored["system"], stored["gain"], claim["kind"], claim["data"]))

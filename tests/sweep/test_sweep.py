@@ -617,6 +617,21 @@ def test_a_manifest_that_cannot_be_read(tmp_path, text):
         Results(tmp_path)
 
 
+@killed_by("uncertainty.sweep.manifest", "isinstance(stated, bool) or", "")
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        (4, "format = 4 was written by a newer diffabs; version 3 is needed"),
+        (2, "format = 2 was written by an older diffabs; version 3 is needed: read its chunks with pandas"),
+        (True, "format = true is a boolean; 3 is needed"),
+    ],
+)
+def test_a_manifest_of_another_release_is_named(tmp_path, stated, words):
+    (tmp_path / "manifest.json").write_text(json.dumps({"format": stated}))
+    with pytest.raises(SweepError, match=f"is no sweep that can be read: manifest.json: {words}"):
+        Results(tmp_path)
+
+
 WRONG = [
     ({"samples": 0}, "samples = 0 is outside [1, 4294967295]"),
     ({"samples": -3}, "samples = -3 is outside [1, 4294967295]"),

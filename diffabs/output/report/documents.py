@@ -3,12 +3,12 @@
 import errno
 import os
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from diffabs.core.types import JsonObject
 from diffabs.host.documents import DocumentError, kind_of, read_document
-from diffabs.host.values import ScenarioError, format_given
+from diffabs.host.values import ScenarioError, format_given, wrong_kind_error
 
 SUMMARY, MANIFEST = "summary.json", "manifest.json"
 KEYS_BY_KIND: dict[str, tuple[str, ...]] = {  # the keys that only this kind has
@@ -20,6 +20,17 @@ KEYS_BY_KIND: dict[str, tuple[str, ...]] = {  # the keys that only this kind has
     "prove": ("verdict", "refuted_by", "share_left"),
     "design": ("gain", "states", "over", "poles"),
     "certificate": ("format", "system", "claims"),
+}
+MODEL = ("model", "model.parts", "model.parameters")
+TABLES_BY_KIND: dict[str, tuple[str, ...]] = {  # the members that are tables, where a document has them
+    "reproduce": ("digest", "solver"),
+    "sweep": ("failures", "metrics", "sensitivity", "worst", "never", "diverged", "refused"),
+    "rare": ("failures",),
+    "tune": (*MODEL, "model.metrics", "free", "objective", "metrics", "certificate", "engine", "files"),
+    "identify": (*MODEL, "values", "residuals", "data"),
+    "prove": (*MODEL, "over", "bounds"),
+    "design": (*MODEL, "over", "files"),
+    "certificate": ("system",),
 }
 CERTIFICATE_FORMAT = "diffabs certificate"  # a file with another `format` is no document of these
 READABLE_DOCUMENTS = "reproduce, sweep, rare, tune, identify, prove --json, design and certify write"
@@ -80,18 +91,37 @@ def _sort_key(document: Document) -> tuple[bool, str]:
 
 def _documents_of_file(path: pathlib.Path, named: bool = False) -> Iterator[Document]:
     """Yield the documents of a file. Raises ReportError for a `named` file without a document."""
+    problem = f"is not a document that {READABLE_DOCUMENTS}"
     try:
         content = read_document(path)
     except DocumentError as error:
         raise ReportError(f"{path}: {error}") from None
     except ValueError:
-        if named:
-            raise ReportError(f"{path}: is not a JSON document that {READABLE_DOCUMENTS}") from None
-        return
+        content = None
+        problem = f"is not a JSON document that {READABLE_DOCUMENTS}" if path.stat().st_size else "is empty"
     documents = list(_inside(content, path))
+    if path.name == SUMMARY and (path.parent / MANIFEST).is_file():
+        _check_summary(path, documents, problem)
     if named and not documents:
-        raise ReportError(f"{path}: is not a document that {READABLE_DOCUMENTS}")
+        raise ReportError(f"{path}: {problem}")
     yield from documents
+
+
+def _check_summary(path: pathlib.Path, documents: Sequence[Document], problem: str) -> None:
+    """Raise ReportError for the summary of a sweep that is another document, or none."""
+    kinds = [document.kind for document in documents]
+    if kinds != ["sweep"]:
+        problem = f"is of {' and '.join(kinds)}, and a document of sweep is needed" if kinds else problem
+        raise ReportError(f"{path}: {problem}; diffabs sweep ... --resume writes it again")
+
+
+def check_tables(document: Document) -> None:
+    """Raise ReportError for a member of a document that is no table, where its kind has one."""
+    for path in ("made", "versions", *TABLES_BY_KIND[document.kind]):
+        parent, _, name = path.rpartition(".")
+        table = document.content.get(parent, {}) if parent else document.content
+        if name in table and not isinstance(table[name], dict):
+            raise ReportError(str(wrong_kind_error(path, table[name], "a table")))
 
 
 def _inside(content: object, path: pathlib.Path) -> Iterator[Document]:

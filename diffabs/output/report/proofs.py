@@ -3,7 +3,7 @@
 import shlex
 
 from diffabs.core.types import Table
-from diffabs.output.report.documents import Document
+from diffabs.output.report.documents import Document, ReportError
 from diffabs.output.report.page import (
     VERDICT_NAMES,
     ReportTable,
@@ -123,7 +123,10 @@ def _notes(content: Table) -> list[str]:
 def certificate_section(document: Document) -> Section:
     """Return the section of a saved certificate, read again, whose claims are proved again."""
     content = document.content
-    proved = verify_file(document.path)
+    try:
+        proved = verify_file(document.path)
+    except ValueError as error:
+        raise ReportError(str(error)) from None
     system = content["system"]
     corners = system.get("corners") or []
     names = list(corners[0]) if corners else []

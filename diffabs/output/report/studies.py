@@ -5,8 +5,7 @@ import shlex
 from collections.abc import Iterator, Mapping
 
 from diffabs.core.types import JsonObject, Table
-from diffabs.host.documents import read_document
-from diffabs.output.report.documents import MANIFEST, Document
+from diffabs.output.report.documents import Document
 from diffabs.output.report.page import (
     Figure,
     ReportTable,
@@ -23,6 +22,7 @@ from diffabs.output.report.page import (
 from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import ScenarioError, loads
 from diffabs.uncertainty.sweep.checking import describe_turned_metrics
+from diffabs.uncertainty.sweep.manifest import read_manifest
 
 FIGURES, UNDRAWN = "figures", "No figures: diffabs sweep ... --figures draws them."
 CAPTIONS = {
@@ -39,7 +39,7 @@ INTERVAL = ("value", "low", "high")
 def sweep_section(document: Document) -> Section:
     """Return the section of a sweep."""
     content = document.content
-    manifest = read_document(document.folder / MANIFEST)
+    manifest = read_manifest(document.folder)
     study, source, units = manifest["study"], manifest["source"], manifest.get("units") or {}
     commit = {"commit": manifest["commit"]} if manifest.get("commit") else {}
     origin = content.get("made", {})  # a summary of `summarise_sweep` has none

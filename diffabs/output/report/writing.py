@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 
 from diffabs import __version__
 from diffabs.host import files
-from diffabs.host.values import make_printable
+from diffabs.host.documents import DocumentError
+from diffabs.host.values import ScenarioError, make_printable
 from diffabs.output.report import experiments, findings, proofs, studies
-from diffabs.output.report.documents import Document, ReportError, find_documents
+from diffabs.output.report.documents import Document, ReportError, check_tables, find_documents
 from diffabs.output.report.page import Section, shown_numbers
 
 MARK = b'<meta name="generator" content="diffabs report'  # near the start of every report
@@ -71,10 +72,15 @@ def write_report(sources: Sequence[pathlib.Path], target: pathlib.Path, title: s
 
 def _section(document: Document) -> Section:
     try:
+        check_tables(document)
         return SECTION_BY_KIND[document.kind](document)
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, OSError) as error:
+    except (DocumentError, ScenarioError) as error:
+        message = str(error)
+    except (TypeError, AttributeError):
+        message = "a value in it is of the wrong type"
+    except (KeyError, IndexError, ValueError, OSError) as error:
         message = " ".join(f"{type(error).__name__} {error}".split())
-        raise ReportError(f"{document.path}: cannot be read as a document of {document.kind}: {message}") from None
+    raise ReportError(f"{document.path}: cannot be read as a document of {document.kind}: {message}")
 
 
 def is_report(path: pathlib.Path) -> bool:

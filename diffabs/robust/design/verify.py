@@ -168,8 +168,9 @@ def _reject_duplicate_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _certificate_from_json(value: object) -> StoredCertificate:
     file = _read_members(value, "the file", "format", "version", "system", "gain", "claims")
-    if file["format"] != "diffabs certificate" or file["version"] != 1.0:
-        raise ValueError("format and version are not those of a diffabs certificate, 1")
+    for name, needed in (("format", "diffabs certificate"), ("version", 1.0)):
+        if type(file[name]) is not type(needed) or file[name] != needed:
+            raise ValueError(f"{name} = {json.dumps(file[name])[:60]}; {json.dumps(needed)} is needed")
     sizes: dict[str, int] = {"2": 2}
     scheduled = isinstance(file["system"], dict) and "cells" in file["system"]
     nodes, parts = [], {"system": file["system"]}

@@ -54,8 +54,7 @@ DECISIVE_PACKAGES = (
 )  # packages, in addition to JAX, that can change a bit of the results
 POSITIVE_SECONDS = ParameterSpec("s", low=0.0, open_low=True)
 OWNER_KEYS = ("format", "study", "versions")
-EARLIER_FORMATS = (1, 2)
-EARLIER_FORMAT_MESSAGE = "written by an earlier diffabs: read its chunks with pandas, or sweep again"
+OLD_MANIFEST_ADVICE = "read its chunks with pandas, or sweep again"
 
 
 def describe_owner(study: Study) -> JsonObject:
@@ -116,10 +115,7 @@ def read_manifest(folder: pathlib.Path) -> JsonObject:
 def _check_manifest(document: object) -> JsonObject:
     if not isinstance(document, dict):
         raise wrong_kind_error("it", document, "a table")
-    if document.get("format") in EARLIER_FORMATS:
-        raise ValueError(EARLIER_FORMAT_MESSAGE)
-    if document.get("format") != MANIFEST_FORMAT:
-        raise wrong_kind_error("format", document.get("format"), str(MANIFEST_FORMAT))
+    _check_format(document.get("format"))
     manifest = {name: value for name, value in document.items() if name != "digest"}
     if document.get("digest") != json_digest(manifest):
         raise ValueError("it was changed after it was written: its digest is another one")
@@ -131,6 +127,14 @@ def _check_manifest(document: object) -> JsonObject:
     for name in {"sample", *FLAG_COLUMNS, *study.space.paths} & study.objectives.keys():
         raise ScenarioError(f"study.objectives.{name}: another column of the table has this name")
     return manifest
+
+
+def _check_format(stated: object) -> None:
+    if isinstance(stated, bool) or not isinstance(stated, int | float):
+        raise wrong_kind_error("format", stated, str(MANIFEST_FORMAT))
+    if stated != MANIFEST_FORMAT:
+        error = documents.other_release_error(stated, stated, MANIFEST_FORMAT)
+        raise error if stated > MANIFEST_FORMAT else ValueError(f"{error}: {OLD_MANIFEST_ADVICE}")
 
 
 def _read_utf8(text: PyTree, path: str) -> str:

@@ -84,7 +84,7 @@ def certificate_from_json(value: object) -> tuple[Polytope | Schedule, np.ndarra
     kind, version, system, gain, claims = read_members(
         value, "the file", "format", "version", "system", "gain", "claims"
     )
-    if kind != CERTIFICATE_FORMAT or version != CERTIFICATE_VERSION:
+    if kind != CERTIFICATE_FORMAT or version is True or version != CERTIFICATE_VERSION:
         raise ValueError(
             f"format and version must be {CERTIFICATE_FORMAT!r} and {CERTIFICATE_VERSION}; are {kind!r} and {version!r}"
         )
