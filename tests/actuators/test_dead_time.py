@@ -32,6 +32,7 @@ def test_a_pulse_is_longer_or_shorter_by_the_difference(rise, fall):
 
 
 @killed_by("parts.actuators.dead_time", "jnp.where(before, m.due, jnp.inf)", "m.due")
+@pytest.mark.slow
 def test_a_fall_that_would_come_first_cancels_the_pulse():
     assert run_of(DeadTime(rise=0.035, fall=0.01)).metrics["mean"][1] == 0
     two = run_of(DeadTime(rise=0.035, fall=0.01), [0.0, 1.0, 2.0, 0.0, 0.0, 0.0])  # the fall cancels both rises

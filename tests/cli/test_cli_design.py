@@ -288,6 +288,7 @@ def greatest_deceleration(speed):
 
 @killed_by("robust.design.loop_task", "i = int(np.argmax(decelerations / speeds))", "i = 0")
 @killed_by("robust.design.speed_scaled", "if not deceleration * period < speed:", "if False:")
+@pytest.mark.slow
 def test_the_relative_fall_counts_air_drag_at_every_speed(tmp_path):
     path = tmp_path / "vehicle.toml"
     path.write_text(VEHICLE)

@@ -18,6 +18,7 @@ from diffabs.cli.show import show_verification
 from diffabs.cli.show_proofs import show_box_proof
 from diffabs.robust.reach.extremes import ExtremeRuns
 from diffabs.scenario.outside import lend_modules
+from diffabs.scenario.parameter_paths import read_box
 from diffabs.scenario.scenario import load
 
 pytestmark = pytest.mark.usefixtures("native_prover", "any_step_is_stable")
@@ -170,8 +171,14 @@ def test_the_table_of_a_proof_has_units_and_no_negative_zero(capsys: pytest.Capt
 
 
 @killed_by("scenario.parameter_paths", "low and math.nextafter", "math.nextafter")
-@pytest.mark.usefixtures("without_runs")
 def test_a_single_value_zero_is_not_widened() -> None:
+    (side,) = read_box({"initial.slip": "0:0"}, "--over", load("slip-lmi", integrated=False).loop)
+    assert side.ends == (0.0, 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_runs")
+def test_a_proof_of_a_single_value_zero_says_zero() -> None:
     words = ("--over", "plant.mass=5.5:5.5", "--over", "initial.slip=0:0", "--budget", "1")
     found = json.loads(run("prove", "slip-lmi", *LIMITED, *words, "--claim", "no_lock", "--json", status=1).stdout)
     assert found["over"]["initial.slip"] == [0.0, 0.0]

@@ -63,6 +63,7 @@ def test_tables_for_a_person(scenario, runs, monkeypatch):
 @killed_by("cli.show_samples", "'>' if row['strict'] else '>='", "'>='")
 @killed_by("uncertainty.reliability.subset_simulation", "'>' if last.strict else '>='", "'>='")
 @killed_by("output.report.studies", '"above" if row.get("strict") else "at least"', '"at least"')
+@pytest.mark.slow
 def test_a_level_at_the_bound_is_above_it(scenario, tmp_path, capsys, monkeypatch):
     interrupts = [KeyboardInterrupt()]
 

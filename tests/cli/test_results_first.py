@@ -62,6 +62,7 @@ def test_a_run_that_cannot_be_drawn_is_shown(file, tmp_path, monkeypatch):
 
 
 @killed_by("cli.margins", "with console.show_before_errors(show_result):", "if True:")
+@pytest.mark.slow
 def test_margins_that_cannot_be_drawn_are_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(margins, "_draw", fill_disk)
     content = shown("margins", "slip-lmi", "--samples", "2", "--plot", tmp_path / "loop.png")

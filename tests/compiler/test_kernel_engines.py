@@ -230,6 +230,7 @@ class TestTune:
             tune.build_problem(braking(controller=SortedTorque()), **TUNED, engine="kernel").find_engine()
 
     @killed_by("engine.drive.kernel", "if rows.shape[1] > MAX_COMPARED_ENTRIES:", "if False:")
+    @pytest.mark.slow
     def test_of_a_long_past_names_the_part(self):
         why = r"engine = 'kernel' is not possible: log: of 1296 rows; 64 are the most \(in Delay.record\)"
         with pytest.raises(EngineError, match=why):

@@ -59,7 +59,7 @@ def _ulps(found, expected, dtype):
 @killed_by("compiler/native/functions.h", "0.14268306f", "0.14269306f", case="float32-")
 @killed_by("compiler/native/functions.h", "n*0x1.0bfbe8p-15f;", "n*0x1.0bfce8p-15f;", case="float32-")
 @pytest.mark.parametrize("plain", PLAIN, ids=["", "plain"])
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dtype", cases([np.float64, np.float32], np.float32))
 def test_elementary_functions_are_right_to_one_ulp(dtype, plain, monkeypatch):
     if plain:
         replace_seam(monkeypatch, "cpp_flags", (*toolchain.CPP_FLAGS, "-DPLAIN"))
@@ -92,6 +92,7 @@ def test_ends_of_functions(plain, monkeypatch):
             np.testing.assert_array_equal(np.signbit(found[name][zeros]), np.signbit(expected[zeros]), err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", cases([np.float64, np.float32], np.float32))
 def test_hyperbolic_functions_up_to_their_overflow(dtype):
     """The exponential overflows before them, at 709.78; their halves do at 710.47, in single precision at 89.41."""
@@ -218,6 +219,7 @@ def test_rules_are_those_of_jax():
 
 
 @killed_by("compiler/native/lanes.h", "0x4530000080000000ull", "0x4530000000000000ull")
+@pytest.mark.slow
 def test_whole_numbers_of_64_bits_are_rounded_once(monkeypatch):
     """On a processor without AVX-512 the conversion is ours."""
     if platform.machine() == "x86_64":

@@ -68,7 +68,7 @@ FURTHER = [((1.0, 1.0), 1.0), ((1.0, 1.0), -1.0), ((0.3, 0.0), -1.0), ((0.0, 0.6
 @pytest.mark.parametrize(
     ("b", "c", "sign"),
     [
-        (0.3, 0.0, 1.0),
+        pytest.param(0.3, 0.0, 1.0, marks=pytest.mark.slow),
         (0.0, 0.6, -1.0),
         *[pytest.param(*weights, sign, marks=pytest.mark.slow) for weights, sign in FURTHER],
     ],

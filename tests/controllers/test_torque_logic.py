@@ -35,7 +35,10 @@ def mean(controller, plant=RISING, length=LENGTH):
         # The slip is 0.04 where the torque reaches 10: no hold before it is lowered.
         (RISING, 0.02, 0.03, 0.5 * 10 * 0.1 + 7.5 * 0.05 + 5 * 0.35),
         # 0.16 there, and 0.14 where it reaches 5: it rises again at once, and is held for good.
-        (Script(read=lambda t: seen(0.2 - 0.4 * t)), 0.145, 0.15, 0.5 * 10 * 0.1 + 2 * 7.5 * 0.05 + 10 * 0.3),
+        pytest.param(
+            *(Script(read=lambda t: seen(0.2 - 0.4 * t)), 0.145, 0.15, 0.5 * 10 * 0.1 + 2 * 7.5 * 0.05 + 10 * 0.3),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["inside", "high", "falls"],
 )

@@ -228,6 +228,7 @@ def test_no_parameter_and_equal_ends():
 
 @killed_by("robust.design.parameter_grid", "data, labels, model", "data, labels, _")
 @killed_by("robust.design.frozen", "data, labels, model", "data, labels, _")
+@pytest.mark.slow
 def test_a_period_fixed_by_the_box_is_that_of_the_systems():
     over = {"sampling.period": (4e-3, 4e-3)}
     slower = replace(SAMPLED, {"sampling.period": 4e-3})

@@ -282,6 +282,7 @@ CHAIN = {n: (jnp.eye(n, k=1)[None], jnp.eye(n)[None, :, -1:]) for n in (1, 2, 3)
 
 @killed_by("robust.design.interior.decay_rate", "jnp.where(possible, new, old)", "new")
 @killed_by("robust.design.interior.decay_rate", "path.settled >= FINAL_CENTRE_STEPS, jnp", "path.settled >= 0, jnp")
+@pytest.mark.slow
 def test_decay_at_a_multiple_pole_is_just_below_it():
     """(s + p)^n, or (z - p)^n: no P proves the rate of the pole itself."""
     at_poles = (((-1.0, -2.0), 1.0), ((-4.0, -4.0), 2.0), ((-1e4, -200.0), 100.0), ((0.0, 0.0), 0.0))

@@ -204,6 +204,7 @@ def test_a_part_has_one_table_and_no_signature(site):
     assert "<h3" not in pid  # no methods
 
 
+@pytest.mark.slow
 def test_see_also_is_a_list_of_links(site):
     page = (site / "reference" / "loops" / "index.html").read_text()
     (measure,) = re.findall(r'<h3 id="diffabs.measure".*?(?=<h3 )', page, re.DOTALL)

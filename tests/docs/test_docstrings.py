@@ -139,6 +139,8 @@ DEAR = (  # some seconds of compiling
     *(
         "diffabs.linear.regulator.lqr",
         "diffabs.linear.riccati.care",
+        "diffabs.linear.regulator.dlqr",
+        "diffabs.scenario.simulation.simulate",
         "diffabs.uncertainty.reliability.failure.failure_probability",
     ),
     *("diffabs.loop.ensemble.run_batch", "diffabs.loop.run.measure", "diffabs.linear.linearization.linearize"),

@@ -265,6 +265,7 @@ def test_a_batch_that_is_a_dictionary_is_refused():
         d.run_batch(d.braking(), {"plant.mass": [12.0]}, d.FixedStep(1e-3, 1.0))  # pyright: ignore
 
 
+@pytest.mark.slow
 def test_a_tick_may_read_the_signal_before_it():
     tick = lambda self, clock, memory, signal: Memory((), clock.before.measured.above)  # noqa: E731
     assert measure("highest", controller=switching(tick=tick)) == measure("highest", controller=switching())

@@ -65,7 +65,9 @@ class Slips:
     "missed & ~search.at_once & (search.tries < MAX_LOCATION_ATTEMPTS)",
     "missed & False",
 )
-@pytest.mark.parametrize("solver", [d.FixedStep(H, 0.01, kinks=False), d.Adaptive(1e-5, 0.01, H)])
+@pytest.mark.parametrize(
+    "solver", [d.FixedStep(H, 0.01, kinks=False), pytest.param(d.Adaptive(1e-5, 0.01, H), marks=pytest.mark.slow)]
+)
 def test_a_margin_that_falls_all_at_once_is_landed_on(solver):
     """Where it is still flat, a parabola through three tries may take it for near its zero, and its fall there leads
     hundreds of steps away."""

@@ -175,10 +175,9 @@ def test_a_sliding_run_has_no_derivative_and_says_so(name, users_engine):
     assert "slides along a switching surface" in str(run)
 
 
-@pytest.mark.parametrize("node", [50.0, pytest.param(45.0, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    "solver", [pytest.param(d.Adaptive(1e-9, 0.1), marks=pytest.mark.slow), d.FixedStep(1e-3, 0.1, kinks=True)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("node", [50.0, 45.0])
+@pytest.mark.parametrize("solver", [d.Adaptive(1e-9, 0.1), d.FixedStep(1e-3, 0.1, kinks=True)])
 @killed_by("engine.step.event_location", "length, landing, beyond)", "length, landing + beyond, 0.0)")
 def test_a_run_that_starts_on_a_node_with_a_rate_that_turns_is_no_slide(node, solver):
     """At small slip the measured curve is negative: the body's rate rises before it falls through zero, and so does the

@@ -26,6 +26,7 @@ def staged():
 
 
 @killed_by("engine.drive.runs", 'if getattr(result, "trajectory", None) is None:', "if True:")
+@pytest.mark.slow
 def test_a_staged_batch_can_be_differentiated():
     program = jex.jaxpr_as_fun(jax.make_jaxpr(slips)(MASS))
     (slope,) = jax.eval_shape(lambda mass: jax.jvp(program, (mass,), (jnp.ones_like(mass),))[1], MASS)

@@ -196,12 +196,9 @@ FIXED = d.FixedStep(1e-2, 3.0)
     "jnp.where(with_start, 0.0,",
     case="adaptive",
 )
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "solver",
-    [
-        pytest.param(d.Adaptive(1e-8, 3.0), id="adaptive"),
-        pytest.param(FIXED, id="fixed", marks=pytest.mark.slow),
-    ],
+    "solver", [pytest.param(d.Adaptive(1e-8, 3.0), id="adaptive"), pytest.param(FIXED, id="fixed")]
 )
 def test_the_time_at_rest_has_a_derivative(solver):
     """The speed leaves zero with the slope zero, so the friction decides when it does."""

@@ -522,6 +522,7 @@ def test_a_tuning_names_the_bounds_at_which_it_ended(file):
 
 
 @killed_by("output.explore.tuning", "if loop.corners.unstable:", "if False:")
+@pytest.mark.slow
 def test_unstable_corners_are_named(file):
     """By the poles of the closed loops; a positive gain drives the slip away."""
     now = Session(str(file(SHORT))).scenario()

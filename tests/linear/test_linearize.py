@@ -99,7 +99,13 @@ def differences(function, z, h):
     return np.stack([(function(z + d) - function(z - d)) / (2 * h) for d in h * np.eye(len(z))], axis=1)
 
 
-@pytest.mark.parametrize("plant", [QuarterCar(road=WET_ASPHALT), LabRig()], ids=["car", "lab rig"])
+@pytest.mark.parametrize(
+    "plant",
+    [
+        pytest.param(QuarterCar(road=WET_ASPHALT), id="car"),
+        pytest.param(LabRig(), id="lab rig", marks=pytest.mark.slow),
+    ],
+)
 def test_linearize_against_differences(plant):
     state = plant.start(BrakeStart(speed=11.0, slip=0.15))
     x, unravel = ravel_pytree(jax.tree.map(float, state))
@@ -136,6 +142,7 @@ def test_tracking_away_from_equilibrium(brake):
 
 @killed_by("linear.linearization", "(narrow * NARROWER**KINK_POWER > wide) & ", "(wide < 0.0) & ")
 @killed_by("linear.linearization", "jnp.where(kinked, jnp.nan, x)", "jnp.where(kinked, x, x)")
+@pytest.mark.slow
 def test_no_slip_model_at_a_knot_of_the_friction():
     """Where the slope is 0.6 below and -0.4 above, at slip 0.2; close to the knot each side has its own model."""
     rig = MirroredRig(road=PiecewiseLinear())
@@ -203,6 +210,7 @@ def test_a_jump_is_a_kink_and_a_power_of_1_5_is_none():
 
 @killed_by("linear.linearization", "narrow * NARROWER / offset > counts", "narrow > 0.0")
 @killed_by("linear.linearization", "NARROWER**KINK_POWER > wide", "NARROWER**3 > wide")
+@pytest.mark.slow
 def test_a_steep_curve_has_no_kink():
     """Friction that bends within a slip of 0.0001, or hardly at all."""
     slips = np.geomspace(1e-4, 0.5, 40)
@@ -297,6 +305,7 @@ def test_a_plant_at_a_kink_has_no_linear_model():
         linearize(Oven(), Temperature(1.0), 1.0)
 
 
+@pytest.mark.slow
 def test_tracking_needs_coordinates():
     car = QuarterCar()
     state = car.start(BrakeStart(speed=10.0, slip=0.1))

@@ -81,6 +81,7 @@ def test_a_run_says_for_how_long_its_control_is_at_a_limit():
 
 
 @killed_by("parts.objectives.tracking", "smaller(memory.held / jnp.where(t > 0, t, 1.0), 1.0)", "memory.held / t")
+@pytest.mark.slow
 def test_a_run_always_at_a_limit_is_valid():
     """In single precision the sum of 1,333 steps exceeds their end by 2e-5."""
     loop = d.replace(d.braking(), {"controller.high": 2.0, "controller.kp": 500.0})

@@ -104,6 +104,7 @@ def test_arithmetic_of_a_source():
     assert rows["distance saved, split road, fuzzy logic"]["verdict"] == "reproduced"
 
 
+@pytest.mark.slow
 def test_a_row_without_a_printed_number_is_undecidable():
     with jax.enable_x64(True):
         row = next(judge_row(row) for row in read_rows() if row["source"] == "dyad")

@@ -129,7 +129,16 @@ def lagrangian(p, q, rates):
     "r2 = torque - c2 * sin2 * v1**2 - arm",
     case="upright",
 )
-@pytest.mark.parametrize("plant", [ARM, HANGING, GEARED], ids=["upright", "hanging", "geared"])
+@pytest.mark.parametrize(
+    "plant",
+    [
+        pytest.param(ARM, id="upright"),
+        *(
+            pytest.param(plant, id=name, marks=pytest.mark.slow)
+            for name, plant in (("hanging", HANGING), ("geared", GEARED))
+        ),
+    ],
+)
 def test_the_closed_form_is_lagranges_equation(plant):
     """M q'' = force + dL/dq - (d2L/dq'dq) q', M = d2L/dq'2. Both round at 1e-16 times the condition of M, about 20."""
     x, torque = states(1), np.random.default_rng(2).uniform(-500, 500, COUNT)

@@ -41,6 +41,7 @@ MASSES_AND_SPEEDS = {"plant.mass": (5.3, 6.2), "initial.speed": (5.0, 6.0)}
 
 @killed_by("robust.reach.extremes", "np.nanargmax(column)", "np.nanargmin(column)")
 @killed_by("robust.reach.extremes", "np.nanmin(columns[name])", "np.nanmax(columns[name])")
+@pytest.mark.slow
 def test_the_fastest_brake_needs_the_longest_way() -> None:
     scenario = load("slip-lmi", ["solver.duration=3"], integrated=False)
     extremes = find_extreme_runs(scenario.loop, scenario.solver, MASSES_AND_SPEEDS)

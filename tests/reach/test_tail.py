@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from marks import cases
 from mutants import killed_by
 from seams import replace_seam
 
@@ -75,7 +76,7 @@ def prover_of(equations: Equations) -> Prover:
     return prover
 
 
-PERIODS = pytest.mark.parametrize("period", [None, 0.01], ids=["continuous", "sampled"])
+PERIODS = pytest.mark.parametrize("period", cases([None, 0.01], 0.01), ids=["continuous", "sampled"])
 
 
 def tail_of(prover: Prover) -> RunTail:
@@ -141,7 +142,7 @@ def test_a_cell_that_ends_in_the_tail_bounds_its_runs(period: float | None) -> N
     assert not np.array_equal(ended.time, direct.time)  # the tail was used
 
 
-@pytest.mark.parametrize("bound", [0.21, 0.2001])
+@pytest.mark.parametrize("bound", cases([0.21, 0.2001], 0.21))
 def test_the_claims_hold_in_the_tail(monkeypatch: pytest.MonkeyPatch, bound: float) -> None:
     replace_seam(monkeypatch, "cells_before_tail", 0)
     replace_seam(monkeypatch, "proved_equations", lambda loop, over: brake())
@@ -308,7 +309,7 @@ def test_the_speed_is_no_settled_state(monkeypatch: pytest.MonkeyPatch, honest: 
     "y = q.centre + integral + _symmetric(q.uncertainty)",
     "y = q.centre + _symmetric(q.uncertainty)",
 )
-@pytest.mark.parametrize("speed", [1.1, 5.5], ids=["too slow to settle", "settles"])
+@pytest.mark.parametrize("speed", cases([1.1, 5.5], 1.1), ids=["too slow to settle", "settles"])
 def test_the_checker_bounds_runs_that_end_in_the_tail(speed: float) -> None:
     checker = pytest.importorskip("diffabs.robust.reach.checker")
     tail, steps = tail_of(prover_of(brake())), [2e-3]

@@ -45,6 +45,7 @@ def judge(document: JsonObject) -> FileVerdict:
     return verify_box(chosen.loop, chosen.solver.duration, document, share=1e-6)
 
 
+@pytest.mark.slow
 def test_a_file_is_verified(proof: pathlib.Path) -> None:
     found = json.loads(run("verify", proof, "--share", "1e-6", "--json").stdout)
     assert found["proved"]

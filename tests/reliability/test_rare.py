@@ -209,6 +209,7 @@ class TestSubset:
         "note if subset is plain else f",
         "note if subset is not None else f",
     )
+    @pytest.mark.slow
     def test_a_late_second_region_is_an_assumption_that_the_note_states(self):
         """The second region has a third of the failures but enters at a late level: the page on sweeps has figures."""
         truth = 1 - norm.cdf(4.0) * norm.cdf(3 + 3.5 / 3)

@@ -157,6 +157,7 @@ def test_a_level_states_whether_its_bound_is_exceeded(dtype, monkeypatch):
 
 
 @killed_by("uncertainty.reliability.failure", "np.where(accepted, score[: len(z)], -np.inf)", "score[: len(z)]")
+@pytest.mark.slow
 def test_a_refused_trial_shortens_the_search(monkeypatch):
     """The tangent of tanh leads from a failure far below the speed at which a run stops: no metric means a thing."""
     bound = float(np.tanh(4 * 0.5))  # at 3.5 standard deviations

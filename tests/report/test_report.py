@@ -81,7 +81,7 @@ def results(tmp_path_factory):
 
 
 KINDS = ("sweep", "tune", "design", "identify", "rare")
-LONG = ("sweep", "identify", "rare")
+LONG = ("sweep", "tune", "identify", "rare")
 SOURCES = {"sweep": "sweep", "certificate": "certificate.json", **{kind: f"{kind}.json" for kind in
            ("tune", "design", "identify", "rare")}}  # fmt: skip
 

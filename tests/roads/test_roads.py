@@ -342,6 +342,7 @@ def test_peak_of_straight_lines_moves_with_its_knot():
 
 
 @killed_by("parts.roads.optimum", "jnp.abs(slope(s0)) < ", "jnp.abs(curvature) > 0.0 * ")
+@pytest.mark.slow
 def test_peak_at_a_kink_beside_a_curve():
     """Half a table, which peaks at its knot, and half a smooth curve past its peak: slip and mu move with the knot."""
     table = PiecewiseLinear(slip=np.array([0.0, 0.1, 0.2, 1.0]), mu=np.array([0.0, 0.8, 1.0, 0.7]))
@@ -369,6 +370,7 @@ class Crossing:
 
 
 @killed_by("parts.roads.optimum", "mu(end + (s - s0))", "mu(end) + slope(end) * (s - s0)")
+@pytest.mark.slow
 def test_two_derivatives_of_a_peak_where_curves_cross():
     """Against differences of the crossing that SciPy finds."""
 

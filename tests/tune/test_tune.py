@@ -9,6 +9,7 @@ import optax
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from marks import cases
 from mutants import killed_by
 from scipy.optimize import brentq, minimize
 
@@ -257,7 +258,7 @@ class TestFlatEnds:
 
     @killed_by("tune.descent", "gradient = np.where(gradient * z > 0, gradient", "gradient = np.where(False, gradient")
     @killed_by("tune.descent", "update = np.where(leaves & ", "update = np.where(False & ")
-    @pytest.mark.parametrize("share", [1e-2, 1e-4, 1e-6, 1e-8, 1 - 1e-8])
+    @pytest.mark.parametrize("share", cases([1e-2, 1e-4, 1e-6, 1e-8, 1 - 1e-8], 1e-2, 1e-4, 1e-6))
     def test_a_start_at_a_flat_end_leaves_it(self, share):
         interval = Interval(0.0, 1.0)
         evaluate, loss = evaluation(lambda z: (interval.value(z[0]) - 0.7) ** 2)
@@ -337,7 +338,7 @@ class TestConstraints:
 
     @killed_by("tune.augmented_lagrangian", "np.full(count, self.method.margin)", "np.zeros(count)")
     @killed_by("tune.augmented_lagrangian", "_raise_penalty(_raise_multipliers(m, descent_states)", "_raise_penalty(m")
-    @pytest.mark.parametrize("start", [(2.0, 2.0), (0.1, 0.1), (0.7, 0.7)])
+    @pytest.mark.parametrize("start", cases([(2.0, 2.0), (0.1, 0.1), (0.7, 0.7)], (2.0, 2.0), (0.7, 0.7)))
     def test_what_is_met_is_met_without_a_tolerance(self, start):
         """Multipliers come to a bound from outside; the bound stated, not one beside it, holds where they end. With the
         margin that takes three rounds, aimed at the bound itself nine."""
@@ -349,7 +350,7 @@ class TestConstraints:
         assert found.objective[1] == pytest.approx(2 / 3, rel=5e-3)  # a margin of 1e-3 costs 2e-3 of it
 
     @killed_by("tune.augmented_lagrangian", "(bool(is_settled) and descent_state", "(descent_state")
-    @pytest.mark.parametrize("start", [10.0, 2.33, 1.0])
+    @pytest.mark.parametrize("start", cases([10.0, 2.33, 1.0], 10.0, 1.0))
     def test_it_goes_on_beyond_the_first_feasible_round(self, start):
         """x' = k (1 - x) - x for 2 s: the least integral of 1 - x with x(2) <= 0.7, from both sides of the bound."""
         end = lambda k: k / (1 + k) * (1 - jnp.exp(-2 * (1 + k)))  # noqa: E731

@@ -473,6 +473,7 @@ class TestSpeedScaled:
     @killed_by(
         "robust.design.speed_scaled", "jnp.where(torque, 1 + scaled.fall, 1.0) / s", "jnp.where(torque, 1.0, 1.0) / s"
     )
+    @pytest.mark.slow
     def test_a_falling_speed_is_followed_step_by_step(self):
         """Two periods, from v to v+: the physical states, brought to z with the speed of their own instant."""
         v0, speeds = 10.0, (6.0, 5.9, 5.75)
