@@ -3,7 +3,7 @@
     {"format": "diffabs numbers 1", "tolerance": 1e-06, "tables": {"critical_lag": [{"at": "50 km/h", ...}, ...], ...}}
 
 The file holds what `run.py` prints, without times, counts of work, and versions. A run with the default config writes
-it.
+it. Of a study in parts, "tables" has a table for each part, and a run writes that of its part.
 """
 
 import json
@@ -19,18 +19,25 @@ TOLERANCE = 1e-6  # relative, and absolute below 1: other processors and version
 LEFT_OUT = ("config", "figures", "versions", "seconds", "minutes", "rollouts", "samples per rollout")  # or beginnings
 
 
-def store_numbers(run_file: str, results: Mapping[str, Any], tolerance: float = TOLERANCE) -> pathlib.Path:
-    """Write the numbers of a study's results beside its `run.py`, and return the path of the file."""
+def store_numbers(
+    run_file: str, results: Mapping[str, Any], tolerance: float = TOLERANCE, part: str = ""
+) -> pathlib.Path:
+    """Write the numbers of a study's results, or of its part, beside its `run.py`; return the path of the file."""
     path = pathlib.Path(run_file).with_name(FILE)
-    content = {"tolerance": tolerance, "tables": _tables(results)}
+    tables = _tables(results)
+    if part:
+        others = documents.read_document(path)["tables"] if path.exists() else {}
+        tables = dict(sorted({**others, part: tables}.items()))
+    content = {"tolerance": tolerance, "tables": tables}
     path.write_text(documents.format_document(documents.stamp("numbers", content), 1) + "\n", encoding="utf-8")
     return path
 
 
-def find_differences(path: pathlib.Path, results: Mapping[str, Any]) -> list[str]:
+def find_differences(path: pathlib.Path, results: Mapping[str, Any], part: str = "") -> list[str]:
     """Return a line for each number of a study's results that differs from its file by more than the tolerance."""
     stored = documents.read_document(path)
-    return list(_differences(stored["tables"], _tables(results), stored["tolerance"], ""))
+    tables = stored["tables"][part] if part else stored["tables"]
+    return list(_differences(tables, _tables(results), stored["tolerance"], ""))
 
 
 def _tables(results: Mapping[str, Any]) -> Any:

@@ -28,4 +28,6 @@ def test_tunable_numbers_are_single_numbers() -> None:
     numbers = tunable_numbers(loop)
     assert "plant.mass" in numbers
     assert "controller.gain" not in numbers
-    assert all(spec.tunable for spec in numbers.values())
+    sampled = tunable_numbers(d.braking(controller=controllers.Sampled(controller=controllers.PID())))
+    assert "controller.controller.kp" in sampled
+    assert "controller.period" not in sampled

@@ -199,10 +199,12 @@ def test_a_lever_that_locks_itself_is_refused():
 
 @killed_by("core.validity", "has_fault |= bool(within)", "has_fault |= False")
 def test_a_lever_on_a_broken_road_is_not_asked_for():
-    """Rules between parts are for parts that are sound: this spline has fewer frictions than slips."""
+    """Rules between parts are for parts that are sound: a spline has too few frictions, a c1 is infinite."""
     broken = Tabulated(slip=np.array([0.0, 0.1, 0.2, 1.0]), mu=np.array([0.0, 0.5, 0.6]))
     with pytest.raises(ValueError, match=r"^road\.slip and mu have shapes \(4,\) and \(3,\)"):
         check_part(LabRig(road=broken))
+    with pytest.raises(ValueError, match=r"^road\.c1 = inf is outside \[0, inf\)$"):
+        check_part(LabRig(road=Burckhardt(c1=np.inf)))
 
 
 @killed_by(

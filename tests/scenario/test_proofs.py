@@ -29,13 +29,23 @@ def proof(native_prover: None) -> Proof:
     return prove_box(scenario.loop, scenario.solver, OVER, [RunClaim("greatest slip", 0.999)], budget=100.0)
 
 
-@killed_by("scenario.proofs", "extremes=extremes.ranges, suspects", "suspects")
 def test_a_proof_lies_beside_the_extreme_runs(proof: Proof) -> None:
     assert proof.verdict == "proved"
     for name, (least, greatest) in proof.extremes.ranges.items():
         low, high = proof.bounds[name]
         assert low <= least <= greatest <= high
     assert proof.bounds["greatest slip"][1] <= 0.999
+
+
+@killed_by("scenario.proofs", "extremes=extremes.ranges, suspects", "suspects")
+def test_a_run_outside_of_its_bounds_is_no_proof(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only an error of the prover, here an invented run, leads there."""
+    runs = ExtremeRuns({"greatest slip": (0.0, 0.3)}, {"greatest slip": [5.3, 2.8]})
+    monkeypatch.setattr("diffabs.scenario.proofs.find_extreme_runs", lambda *_: runs)
+    scenario = load("slip-lmi", LIMITED)
+    proof = prove_box(scenario.loop, scenario.solver, OVER, [RunClaim("greatest slip", 0.999)], budget=100.0)
+    assert proof.verdict == "undecided"
+    assert "a simulated run has greatest slip = 0, beyond the bound" in proof.reason
 
 
 @killed_by("scenario.proofs", "loop=self.loop, solver=self.solver", "solver=self.solver")
