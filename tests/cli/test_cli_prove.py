@@ -16,6 +16,8 @@ from seams import replace_seam
 
 from diffabs.cli.show import show_verification
 from diffabs.cli.show_proofs import show_box_proof
+from diffabs.robust.reach.claims import overshoot_claim
+from diffabs.robust.reach.equations import derive_equations
 from diffabs.robust.reach.extremes import ExtremeRuns
 from diffabs.scenario.outside import lend_modules
 from diffabs.scenario.parameter_paths import read_box
@@ -109,18 +111,26 @@ def test_an_overshoot_needs_one_target_for_all_runs() -> None:
     )
 
 
+# The first slip, the target, and the bound of the slip: 1 % of the step beyond the target, up or down.
+STEPS = [
+    (0.3, 0.2, "least slip", 0.199),
+    (0.0, 0.004, "greatest slip", 0.00404),
+    (0.05, 0.2, "greatest slip", 0.2015),
+]
+
+
 @killed_by("robust.reach.claims", "bound * step\n", "bound * setpoint\n")
-@pytest.mark.parametrize(
-    ("first", "target", "quantity", "bound"),
-    [
-        (0.3, 0.2, "least slip", 0.199),
-        pytest.param(0.0, 0.004, "greatest slip", 0.00404, marks=pytest.mark.slow),
-        pytest.param(0.05, 0.2, "greatest slip", 0.2015, marks=pytest.mark.slow),
-    ],
-)
-@pytest.mark.usefixtures("without_runs")
+@pytest.mark.parametrize(("first", "target", "quantity", "bound"), STEPS)
 def test_an_overshoot_is_that_of_the_step(first, target, quantity, bound) -> None:
-    """1 % of the step from the first slip to the target, up or down."""
+    loop = load("slip-lmi", [f"reference.slip={target}", f"initial.slip={first}"], integrated=False).loop
+    claim = overshoot_claim(0.01, derive_equations(loop, {"plant.mass": (5.5, 5.5)}))
+    assert (claim.quantity, claim.bound) == (quantity, pytest.approx(bound, rel=1e-12))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("first", "target", "quantity", "bound"), STEPS)
+@pytest.mark.usefixtures("without_runs")
+def test_a_proof_has_the_bound_of_an_overshoot(first, target, quantity, bound) -> None:
     changes = ("--set", f"reference.slip={target}", "--set", f"initial.slip={first}", "--budget", "1")
     words = (*changes, "--over", "plant.mass=5.5:5.5", "--claim", "overshoot=0.01", "--json")
     (claim,) = json.loads(run("prove", "slip-lmi", *LIMITED, *words, status=1).stdout)["claims"]

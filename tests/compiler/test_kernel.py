@@ -47,7 +47,7 @@ LOOP = braking(
 )
 MEASURED = {name: BRAKING[name] for name in ("stop_distance", "iae")}
 SOLVER = d.FixedStep(2e-3, 0.5)
-LANES = 41  # of blocks of 32: some lanes are put in where others have ended
+LANES = 41  # of blocks of 16: some lanes are put in where others have ended
 SPEEDS = np.linspace(26.0, 33.0, LANES) / 3.6
 AT_ONCE, NEVER, DIVERGING = 4, 7, 11
 SPEEDS[AT_ONCE], SPEEDS[NEVER] = 24.0 / 3.6, 90.0 / 3.6
@@ -72,12 +72,14 @@ def _(size, batched, x):
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
     monkeypatch.setenv(library_cache.CACHE, FOLDER)
+    replace_seam(monkeypatch, "vectors_per_block", 2)
 
 
 @pytest.fixture(scope="module")
 def runs():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(library_cache.CACHE, FOLDER)
+        replace_seam(patch, "vectors_per_block", 2)
         return both(LOOP, VALUES, SOLVER, MEASURED, KEYS)
 
 

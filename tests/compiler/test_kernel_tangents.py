@@ -143,6 +143,7 @@ class TestLaunch:
         np.testing.assert_allclose(found, expected, rtol=2e-13, atol=1e-13)
 
     @killed_by("compiler.autodiff.jvp", "if reached == moved_arrays[UpdateLevel.STEP]:", "if True:")
+    @pytest.mark.slow
     def test_only_what_moves_is_carried(self, monkeypatch):
         """The fourth number moves with nothing, and what comes from no tangent is no operation."""
         seen = []

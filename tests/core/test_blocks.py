@@ -388,6 +388,7 @@ def two_maxima(t):
 
 
 @killed_by("parts.references.peak_slip", "zero + MIN_DECELERATION, slip", "zero, slip")
+@pytest.mark.slow
 def test_latch_waits_for_the_brake():
     """A wheel that rolls shows a deceleration of some 1e-5 m/s^2 in single precision, up and down; then the brake."""
 

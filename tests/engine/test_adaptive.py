@@ -422,6 +422,7 @@ def test_a_solver_that_no_run_can_have_is_refused(change, line):
 
 
 @killed_by("engine.step.adaptive", "jnp.where(limit > 0, limit, self.h * self.steps)", "limit")
+@pytest.mark.slow
 def test_a_field_of_infinite_slope_at_its_start_is_solved():
     """A tank that fills, y' = q - sqrt(y): with s = sqrt(y), the time from a to b is the integral of 2 s/(q - s)."""
 
@@ -445,6 +446,7 @@ def test_steps_that_find_themselves_are_never_unstable():
 
 
 @killed_by("engine.step.surfaces", "next = jnp.where((since < -nearest) & (since > next), since, next)", "del nearest")
+@pytest.mark.slow
 def test_lines_say_when_comparisons_change_and_when_they_did():
     numbers = [0, 1, 33, np.array([2, 3])]
     values = [jnp.asarray(3.0), jnp.asarray(-2.0), jnp.asarray(1.0), jnp.array([0.5, 4.0])]

@@ -231,6 +231,7 @@ class Far(NamedTuple):
     "free = ~slots.carry.running | _lanes_ended_early(enough, build_lane, slots, numbers)",
     "free = ~slots.carry.running",
 )
+@pytest.mark.slow
 def test_lanes_make_room_for_others(monkeypatch):
     """The integral of x = (1 - exp(-rate t))/rate; the second lane is over beyond 0.2 m, at the next look."""
     replace_seam(monkeypatch, "lanes_at_once", 2)
@@ -328,7 +329,11 @@ def test_derivatives_are_those_of_single_runs(mode, single):
             Batch(keys=[1, 2, 3]),
             {"accepted": [True, False]},
         ),
-        (ValueError, "enough: lanes that run together", Batch(VALUES), {"enough": Slow(SPEEDS), "trajectories": True}),
+        pytest.param(
+            *(ValueError, "enough: lanes that run together", Batch(VALUES)),
+            {"enough": Slow(SPEEDS), "trajectories": True},
+            marks=pytest.mark.slow,
+        ),
         (
             ValueError,
             "plant.road is of type RationalCurve; the path of a number",
@@ -395,7 +400,7 @@ def test_results_have_the_precision_of_the_loop(together):
 
 
 @killed_by("loop.batch", "(count, *jnp.shape(x))", "(1, *jnp.shape(x))")
-@pytest.mark.parametrize("column", ["weights", "durations"])
+@pytest.mark.parametrize("column", cases(["weights", "durations"], "durations"))
 def test_a_batch_without_values_has_one_result_for_each_run(column):
     batch = Batch(**{column: [0.5, 0.5, 0.1]})
     run = d.run_batch(decay_loop(), batch, d.FixedStep(0.1, 1.0), {"iae": IAE()})

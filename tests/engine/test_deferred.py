@@ -188,6 +188,7 @@ def test_second_derivatives_are_xlas(engines):
 
 
 @killed_by("engine.drive.deferred", "and directions > MAX_DIRECTIONS:", "and False:")
+@pytest.mark.slow
 def test_a_run_with_many_inputs_has_xlas_reverse_mode(engines):
     """y' = -a y with equal states: each moves their sum by exp(-a)."""
     rates = jnp.linspace(0.5, 1.0, 2)

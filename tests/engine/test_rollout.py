@@ -236,6 +236,7 @@ def test_a_batch_ends_with_its_last_lane():
     "invalidate(metrics, diverged, (loop, objectives))",
     "metrics",
 )
+@pytest.mark.slow
 def test_a_diverging_run_changes_no_other_run():
     solver = d.FixedStep(1e-3, 0.5)
 

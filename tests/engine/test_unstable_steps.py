@@ -59,6 +59,7 @@ def test_a_traced_step_is_named_once_unless_it_was_checked(fresh):
 
 
 @killed_by("loop.ensemble", "np.count_nonzero(checks.codes == code)", "0")
+@pytest.mark.slow
 def test_a_batch_says_why_runs_are_refused(fresh):
     loop, measured = decay_loop(100.0), {"iae": IAE()}
     batch = d.Batch({"plant.rate": np.array([100.0, 101.0, -1.0])})

@@ -655,8 +655,8 @@ def test_speeds_of_a_plant_without_a_wheel_stay_in_si(session):
 
 
 @killed_by("output.explore.curves", "(KEPT_MULTIPLE * instants))", "instants)")
-@killed_by("output.explore.curves", "np.append(places, count - 1)", "places")
-@pytest.mark.parametrize("draft", cases([False, True], True))
+@pytest.mark.slow
+@pytest.mark.parametrize("draft", [False, True])
 def test_a_run_that_stops_early_is_drawn_whole(file, draft):
     """A hundredth of the duration has as many instants as a run needs, and its last one is where it stops."""
     chosen = Session(str(file(SHORT.replace("duration = 1.0", "duration = 40.0")))).scenario()
@@ -664,6 +664,10 @@ def test_a_run_that_stops_early_is_drawn_whole(file, draft):
     found = curves.run_curves(chosen, curves.draft_solver(chosen) if draft else None)
     assert 60 < len(found.t) <= 2 * curves.INSTANTS
     assert 0.3 < found.t[-1] == pytest.approx(found.metrics["stop_time"], rel=1e-3)
+
+
+@killed_by("output.explore.curves", "np.append(places, count - 1)", "places")
+def test_curves_are_thinned_to_few_instants_and_the_last_one():
     assert [len(curves.thin(count, 400)) for count in (0, 1, 2, 400, 401, 402, 6401)] == [0, 1, 2, 400, 401, 202, 401]
     assert curves.thin(403, 400)[-1] == 402
 

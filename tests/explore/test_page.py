@@ -127,6 +127,7 @@ def test_texts_of_a_scenario_are_no_attributes():
 
 
 @killed_by("output.explore.page", "self.thinker.ask(partial(self._think, now, version))", "pass")
+@pytest.mark.slow
 def test_results_follow_a_refused_number(visit, monkeypatch):
     async def user(opened):
         page = opened.page

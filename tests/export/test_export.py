@@ -448,6 +448,7 @@ def test_an_operation_without_translation_is_named():
 
 
 @killed_by("output.export.difference_equations", "ENTRY_ROUNDING = 1e-12", "ENTRY_ROUNDING = 0.0")
+@pytest.mark.slow
 def test_difference_equations_leave_out_inputs_of_rounding_errors():
     found = difference_equations(load("slip-cured", integrated=False).loop)
     assert found["H"] == [pytest.approx(-17300.0)]

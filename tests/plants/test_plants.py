@@ -128,17 +128,25 @@ def test_slip_in_driving_and_at_standstill():
         np.testing.assert_allclose(car.output(state).slip, slip, rtol=1e-13, atol=1e-15)
 
 
+CRAWLED = PiecewiseLinear(slip=(0.0, 0.1, 1.0), mu=(0.0, 0.8, 0.7))
+
+
 @killed_by("parts.plants.wheel", "else self.crawl_speed", "else 10.0")
 def test_without_a_stop_the_crawl_speed_limits_the_step():
     """A run may last to standstill, and below the crawl speed c the slip fades as exp(-(g k/c) (1 + m r^2/J) t). RK4 is
     stable to 2.785 of this rate, k is the friction's first slope."""
-    road = PiecewiseLinear(slip=(0.0, 0.1, 1.0), mu=(0.0, 0.8, 0.7))
-    car = QuarterCar(mass=15.0, radius=0.2, inertia=1.0, crawl_speed=0.05, road=road)
+    car = QuarterCar(mass=15.0, radius=0.2, inertia=1.0, crawl_speed=0.05, road=CRAWLED)
     loop = braking(plant=car, initial=BrakeStart(speed=0.2), controller=ConstantTorque(torque=20.0), stop=NoStop())
     limit = 2.785293563405282 / (GRAVITY * 8.0 / 0.05 * (1 + 15.0 * 0.2**2))
     check(loop, FixedStep(0.97 * limit, 0.2))
     with pytest.raises(ValueError, match="is not stable"):
         check(loop, FixedStep(1.03 * limit, 0.2))
+
+
+@pytest.mark.slow
+def test_without_a_stop_a_car_stands_to_the_end():
+    car = QuarterCar(mass=15.0, radius=0.2, inertia=1.0, crawl_speed=0.05, road=CRAWLED)
+    loop = braking(plant=car, initial=BrakeStart(speed=0.2), controller=ConstantTorque(torque=20.0), stop=NoStop())
     run = jax.jit(rollout, static_argnums=1)(loop, FixedStep(1e-4, 0.2))
     last = jax.tree.map(lambda x: float(x[-1]), run.trajectory.sample)
     np.testing.assert_allclose(last.t, 0.2, rtol=1e-12)  # the whole duration, though the car stands from 0.05 s on

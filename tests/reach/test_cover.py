@@ -254,6 +254,7 @@ def test_a_setting_that_does_not_exist_is_refused() -> None:
 
 
 @killed_by("robust.reach.cover", "FEWEST * np.spacing(np.abs(box).max(1))", "0.0")
+@pytest.mark.slow
 def test_a_side_of_two_floats_is_not_halved() -> None:
     """A run that stops too late keeps the proof refining; there is no float between two neighbours."""
     box = {"plant.mass": (float(np.nextafter(5.5, 0.0)), float(np.nextafter(5.5, 6.0)))}

@@ -305,6 +305,7 @@ def test_monotone_curve_is_best_locked():
 
 
 @killed_by("parts.roads.optimum", "jnp.isnan(values[1:]).any()", "False")
+@pytest.mark.slow
 def test_a_road_of_nan_has_no_best_slip():
     assert np.isnan(peak(replace(ICE, {"c1": np.nan})).slip)
 

@@ -50,14 +50,19 @@ def test_a_run_outside_of_its_bounds_is_no_proof(monkeypatch: pytest.MonkeyPatch
 
 @killed_by("scenario.proofs", "loop=self.loop, solver=self.solver", "solver=self.solver")
 @killed_by("scenario.proofs", "loop=self.loop, solver=self.solver", "loop=self.loop")
-def test_a_saved_proof_has_its_loop_and_is_verified(proof: Proof, tmp_path: pathlib.Path) -> None:
-    pytest.importorskip("flint")
+def test_a_saved_proof_has_its_loop(proof: Proof, tmp_path: pathlib.Path) -> None:
     proof.save(tmp_path / "p.json")
     document = read_proof_document(tmp_path / "p.json")
     assert document is not None
     scenario = loads(document["scenario"].encode(), "p", "p")
     assert scenario.solver == proof.solver
     np.testing.assert_array_equal(scenario.loop.controller.high, 9.03)
+
+
+@pytest.mark.slow
+def test_a_saved_proof_is_verified(proof: Proof, tmp_path: pathlib.Path) -> None:
+    pytest.importorskip("flint")
+    proof.save(tmp_path / "p.json")
     verification = verify(tmp_path / "p.json", share=1e-6)
     assert verification.proved
     assert verification.over == {path: pytest.approx(ends) for path, ends in OVER.items()}
