@@ -47,9 +47,9 @@ shape_checks.install()
 jax.config.update("jax_enable_x64", True)
 
 DEAREST = """
-conformance real_rig sweep blocks export kinks batch riccati margins delay cli_tune rollout cli tune refusals papers
-kernel sweep_kill kernel_start explore cli_design linearize kernel_tangents frames sealed adaptive gradients arm_basin
-servo
+conformance kernel sweep deferred tune export sealed riccati proofs roads sweep_statistics blocks certificate linearize
+real_rig batch kinks margins delay cli_tune rollout cli refusals papers sweep_kill kernel_start explore cli_design
+kernel_tangents frames adaptive gradients arm_basin servo
 """  # the last ones for what is slow in them
 
 

@@ -368,10 +368,7 @@ def prepare_parts(part: T) -> T:
 
 
 def refine_parts(part: T, times: int) -> T:
-    """Return the part for shorter steps: each part in it with a method `refined(times)` is replaced by its result.
-
-    Such a part has a memory that covers a number of steps.
-    """
+    """Return the part for shorter steps: each part in it with a method `refined(times)` is replaced by its result."""
     return _rebuild_parts(part, "refined", lambda prefix: (times,))
 
 

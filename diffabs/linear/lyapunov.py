@@ -85,10 +85,7 @@ def as_float_arrays(*values: AnyArray | Rows) -> tuple[Array, ...]:
 
 
 def relative_residual(summed: Array, *terms: jax.Array) -> jax.Array:
-    """Return the norm of the sum of the terms over the sum of their norms; 0 where all terms are 0.
-
-    Its derivative is zero.
-    """
+    """Return the norm of the sum of terms over the sum of their norms, 0 for zero terms, without a derivative."""
     summed, terms = lax.stop_gradient((summed, terms))
     axes = (0, 1)
     # `where` computes both branches, so the divisor is replaced too: no 0/0.

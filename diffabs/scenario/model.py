@@ -17,10 +17,7 @@ if TYPE_CHECKING:
 
 
 def describe_source(scenario: "Scenario") -> JsonObject:
-    """Return the entries that documents on a scenario begin with: "scenario", "model" and "made".
-
-    They hold its name, the values of `describe_model` and those of `describe_command`.
-    """
+    """Return the first entries of a document on a scenario: its name, `describe_model` and `describe_command`."""
     return {"scenario": scenario.name, "model": describe_model(scenario), "made": provenance.describe_command()}
 
 
@@ -31,10 +28,7 @@ def result_document(kind: str, scenario: "Scenario", values: JsonObject, *packag
 
 
 def describe_model(scenario: "Scenario") -> JsonObject:
-    """Return a scenario as JSON values.
-
-    They are title, description, parts, parameters with units, solver, and units of the metrics.
-    """
+    """Return title, description, parts, parameters with units, solver, and units of the metrics as JSON values."""
     return {
         "title": scenario.title,
         "description": scenario.description,

@@ -69,10 +69,7 @@ FAMILIES: dict[str, tuple[tuple[ModuleType, ...], frozenset[str]]] = {
 
 
 def family_types(family: str) -> Table:
-    """Return the parts of a family by name: an instance of each class with its defaults, and the named constants.
-
-    Parts from outside are included.
-    """
+    """Return a family's parts, also those from outside, by name: classes with their defaults, and named constants."""
     try:
         modules = outside.registered_modules()
     except ValueError as error:
@@ -269,10 +266,7 @@ def _find_inner_field(part: Part, key: str) -> str:
 
 
 def build_loop(sections: JsonObject) -> Loop:
-    """Return the loop that the sections of a scenario describe.
-
-    A section that is left out gets the plant's usual part.
-    """
+    """Return the loop of a scenario's sections; a section that is left out gets the plant's usual part."""
     plant = fill_part(braking(), {"plant": sections["plant"]}, "", "").plant if "plant" in sections else braking().plant
     usual_parts, units = getattr(plant, "usual_parts", dict), units_of(plant)
     usual = usual_parts()

@@ -56,10 +56,7 @@ def design_section(document: Document) -> Section:
 
 
 def proof_verdicts(proof: Table) -> list[ReportVerdict]:
-    """Return the verdicts of a certificate: proved, disproved or undecided.
-
-    Without a certificate, one verdict gives the reason.
-    """
+    """Return a certificate's verdicts (proved, disproved or undecided), or one with the reason why there is none."""
     if proof.get("gain") is None:
         return [ReportVerdict("no certificate", proof.get("reason") or "none is required")]
     exactly = ", verified in exact arithmetic" if proof["verified_exactly"] else ""

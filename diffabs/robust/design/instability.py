@@ -18,10 +18,7 @@ BOUNDARY_TOLERANCE = 1e-9  # of the largest singular value of A: below it a sum 
 
 
 def growing_modes(a: np.ndarray, *, discrete: bool) -> Iterator[dict[str, float | np.ndarray]]:
-    """Yield data of claims `unstable` of A (n, n), for modes that grow or stay, the most promising first.
-
-    None of them is proved yet.
-    """
+    """Yield data of unproved claims `unstable` of A (n, n): modes that grow or stay, the most promising first."""
     from scipy.linalg import matrix_balance, solve_continuous_lyapunov, solve_discrete_lyapunov
 
     balanced, (units, _) = matrix_balance(a, permute=False, separate=True)
