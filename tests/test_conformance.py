@@ -141,7 +141,7 @@ def road_slopes(road, slip, speed, distance):
 
 @killed_by("core.numerics", "return s * curve(s * x)", "return curve(s * x)", case="SNOW")
 @killed_by("core.numerics", "jnp.log(jnp.where(nonzero, square, 1.0))", "jnp.log(square)", case="RIG")
-@pytest.mark.parametrize("name", ROADS)
+@pytest.mark.parametrize("name", cases(ROADS, "SPLINE_B", "patches, three", "scaled along, once"))
 def test_road(name):
     """mu(0) = 0, odd, bounded, C1 at 0, and finite with its derivatives where curves are in danger of not being."""
     road = canonical_dtypes(ROADS[name])

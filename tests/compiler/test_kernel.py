@@ -75,24 +75,31 @@ def _own_folder(monkeypatch):
     replace_seam(monkeypatch, "vectors_per_block", 2)
 
 
+def run_lanes_by(engine):
+    lanes = d.Batch(VALUES, KEYS)
+    return jax.device_get(d.run_batch(LOOP, lanes, SOLVER, MEASURED, together=False, accepted=True, engine=engine))
+
+
 @pytest.fixture(scope="module")
 def runs():
+    """The runs by a kernel."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(library_cache.CACHE, FOLDER)
         replace_seam(patch, "vectors_per_block", 2)
-        return both(LOOP, VALUES, SOLVER, MEASURED, KEYS)
+        return run_lanes_by("kernel")
 
 
 class TestRuns:
     @killed_by("compiler/native/drive.h", "lane[p] >= 0 && !get(on[q], p - q*LANES)", "lane[p] >= 0 && !get(on[q], 0)")
     @killed_by("compiler/native/drive.h", "if (fresh) begin(b, s, q);", "")
+    @pytest.mark.slow
     def test_are_those_of_xla(self, runs):
         """Lanes that begin beyond their stop, diverge and run out of time among them; noise to the last digits."""
-        found, expected = runs
+        expected = run_lanes_by("xla")
         assert np.flatnonzero(expected.diverged).tolist() == [AT_ONCE, DIVERGING]
         assert expected.timed_out[NEVER]
         assert len(np.unique(expected.metrics["iae"])) == LANES - 1  # NaN once
-        same(found, expected, rtol=1e-13, atol=1e-15)
+        same(runs, expected, rtol=1e-13, atol=1e-15)
 
     @killed_by("loop.ensemble", 'engine: str = "auto",', 'engine: str = "xla",')
     @killed_by("engine.drive.engine", "            log_kernel()\n", "")
@@ -102,7 +109,7 @@ class TestRuns:
             found = [d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, accepted=True) for _ in range(2)]
         line = f"runs are made by a kernel ({toolchain.find_compiler().version})"
         assert [record.getMessage() for record in caplog.records] == [line]
-        for name, value in runs[0].metrics.items():
+        for name, value in runs.metrics.items():
             np.testing.assert_array_equal(found[0].metrics[name], value)
 
     @pytest.mark.slow
@@ -112,14 +119,14 @@ class TestRuns:
         order = np.random.default_rng(1).permutation(LANES)
         values = {path: column[order] for path, column in VALUES.items()}
         found, _ = (lambda run: (run, None))(self._by_kernel(values, KEYS[order]))
-        for name, value in runs[0].metrics.items():
+        for name, value in runs.metrics.items():
             np.testing.assert_array_equal(found.metrics[name], value[order])
 
     def test_of_new_numbers_are_the_same_program(self, runs, monkeypatch):
         replace_seam(monkeypatch, "build_library", None)
         loop = d.replace(LOOP, {"controller.gain.0": -3900.0, "plant.mass": 6.0})
         found = jax.device_get(self._by_kernel(VALUES, KEYS, loop))
-        assert not np.any(found.metrics["iae"] == runs[0].metrics["iae"])
+        assert not np.any(found.metrics["iae"] == runs.metrics["iae"])
 
     @pytest.mark.slow
     def test_under_jit_and_vmap(self, runs):
@@ -128,14 +135,14 @@ class TestRuns:
 
         mass = float(LOOP.plant.mass)
         found = jax.device_get(jax.jit(jax.vmap(at))(jnp.array([0.97 * mass, mass])))
-        np.testing.assert_allclose(found[1], runs[0].metrics["iae"], rtol=1e-13)
+        np.testing.assert_allclose(found[1], runs.metrics["iae"], rtol=1e-13)
         assert not np.any(found[0] == found[1])
 
     @pytest.mark.slow
     def test_of_lanes_in_two_parts(self, runs, monkeypatch):
         replace_seam(monkeypatch, "max_lanes_per_launch", 32)
         found = jax.device_get(self._by_kernel(VALUES, KEYS))
-        for name, value in runs[0].metrics.items():
+        for name, value in runs.metrics.items():
             np.testing.assert_array_equal(found.metrics[name], value)
 
     @staticmethod

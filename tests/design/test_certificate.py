@@ -302,7 +302,8 @@ def random_claim(rng, kind, discrete, stretch):
     return system, gain, data[kind]
 
 
-@pytest.mark.parametrize(("kind", "discrete"), [(kind, False) for kind in KINDS]
+@pytest.mark.parametrize(("kind", "discrete"), [(kind, False) for kind in KINDS if kind != "scheduled"]
+                         + [pytest.param("scheduled", False, marks=pytest.mark.slow)]
                          + [pytest.param(kind, True, marks=pytest.mark.slow)
                             for kind in KINDS if kind not in ("damping", "scheduled")])  # fmt: skip
 def test_both_verifiers_agree(kind, discrete):

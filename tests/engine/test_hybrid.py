@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from marks import cases
 
 import diffabs as d
 from diffabs.core.pytree import param, pytree
@@ -117,10 +116,9 @@ def last_state(system, objectives, carry):
     return carry.point.state, None
 
 
-ADAPTIVE = [d.Adaptive(1e-6, 10.0, step=0.5), d.Adaptive(1e-8, 2.0)]
-
-
-@pytest.mark.parametrize("solver", cases([d.FixedStep(0.5, 10.0), ADAPTIVE[0]], ADAPTIVE[0]))
+@pytest.mark.parametrize(
+    "solver", [d.FixedStep(0.5, 10.0), pytest.param(d.Adaptive(1e-6, 10.0, step=0.5), marks=pytest.mark.slow)]
+)
 def test_a_difference_equation_has_a_clock_and_no_flow(solver):
     """Of 20 instants after t = 0 the last one ends the run, and changes nothing."""
 
@@ -133,7 +131,8 @@ def test_a_difference_equation_has_a_clock_and_no_flow(solver):
     np.testing.assert_allclose(slope, exact, rtol=1e-12)
 
 
-@pytest.mark.parametrize("solver", cases([d.FixedStep(0.01, 2.0), ADAPTIVE[1]], ADAPTIVE[1]))
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [d.FixedStep(0.01, 2.0), d.Adaptive(1e-8, 2.0)])
 def test_a_ball_bounces_and_has_derivatives(solver):
     """In closed form: it lands at sqrt(2/g) with sqrt(2 g), and rises with e sqrt(2 g) up to t = 1."""
 

@@ -154,6 +154,7 @@ STIFFNESSES = np.linspace(0.3, 2.5, 12)
     "dynamics.surfaces, changed, h), turns.time_since)",
     "dynamics.surfaces, changed, h), 0.0)",
 )
+@pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-3, 1e-4])
 def test_a_stop_that_is_passed_for_a_moment(rtol):
     """Its time in closed form. The margin is positive at both ends of a step with the rtol of 1e-4."""

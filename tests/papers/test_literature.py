@@ -227,6 +227,7 @@ def position_by_matrix_exponential(plant, kp, ki, target, period, samples):
 
 @killed_by("papers.literature", 'np.interp(row["at"]', 'np.interp(row["at"] + 1e-4')
 @killed_by("scenario.outside", "_named.clear()", "pass")
+@pytest.mark.slow
 def test_the_electro_mechanical_brake_has_the_printed_digits():
     """The scenario's step of a tenth of the period has an error of 2e-15 m."""
     with jax.enable_x64(True):

@@ -284,6 +284,7 @@ def test_stuck_lab_wheel_carries_what_the_road_asks():
 
 
 @killed_by("parts.plants.lab_rig", "wheel = jnp.where(rests, 0.0, wheel)", "wheel = jnp.where(rests, wheel, wheel)")
+@pytest.mark.slow
 def test_a_stuck_lab_wheel_stays_at_rest():
     """Exactly, on a thousand roads: a rate of 1e-16, the rounding of a torque that balances another, would turn it,
     and a wheel that turns feels all of the brake."""
