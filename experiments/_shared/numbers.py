@@ -9,13 +9,14 @@ it. Of a study in parts, "tables" has a table for each part, and a run writes th
 import json
 import math
 import pathlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from diffabs.host import documents
 
 FILE = "numbers.json"
 TOLERANCE = 1e-6  # relative, and absolute below 1: other processors and versions of JAX round differently
+SEARCH_TOLERANCE = 1e-3  # of numbers behind a search, whose end the rounding moves
 LEFT_OUT = ("config", "figures", "versions", "seconds", "minutes", "rollouts", "samples per rollout")  # or beginnings
 
 
@@ -31,6 +32,16 @@ def store_numbers(
     content = {"tolerance": tolerance, "tables": tables}
     path.write_text(documents.format_document(documents.stamp("numbers", content), 1) + "\n", encoding="utf-8")
     return path
+
+
+def store_parts(
+    run_file: str, parts: Mapping[str, Callable[[], Mapping[str, Any]]]
+) -> dict[str, Callable[[list[str]], Any]]:
+    """Return the parts of a study for `run_part`; each stores its numbers after its run."""
+    return {
+        name: lambda _, name=name, main=main: store_numbers(run_file, main(), SEARCH_TOLERANCE, name)
+        for name, main in parts.items()
+    }
 
 
 def find_differences(path: pathlib.Path, results: Mapping[str, Any], part: str = "") -> list[str]:

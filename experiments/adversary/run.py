@@ -20,6 +20,7 @@ import numpy as np
 
 from diffabs.papers import record
 from experiments._shared.entry import with_times
+from experiments._shared.numbers import SEARCH_TOLERANCE, store_numbers
 from experiments.adversary.attack import Attack, Running
 from experiments.adversary.bounds import Bounds, nominal, parameters
 from experiments.adversary.check import against_differences, by_block, elsewhere, with_shorter_steps
@@ -213,4 +214,4 @@ def main(config: Config | None = None, progress: Callable[[str], None] | None = 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main(progress=with_times())
+    store_numbers(__file__, main(progress=with_times()), SEARCH_TOLERANCE)

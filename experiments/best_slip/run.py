@@ -20,6 +20,7 @@ from diffabs import Batch, FixedStep, Loop, run_batch
 from diffabs.output import plot
 from diffabs.papers import record
 from experiments._shared.entry import with_times
+from experiments._shared.numbers import SEARCH_TOLERANCE, store_numbers
 from experiments._shared.statistics import interval
 from experiments.best_slip.fixed import ERRORS, EXACT, Fixed, Lanes, best, good, lanes, line
 from experiments.best_slip.rules import FIXED, KNOWN, PAPER, ROBUST, RULES, Ranges, start, told_the_peak, untuned
@@ -179,4 +180,4 @@ def main(config: Config | None = None, progress: Callable[[str], None] = lambda 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main(progress=with_times())
+    store_numbers(__file__, main(progress=with_times()), SEARCH_TOLERANCE)

@@ -35,6 +35,7 @@ from diffabs.tune.identify.fit import Identified, Tolerances
 from diffabs.tune.identify.identification import identify
 from diffabs.tune.identify.residuals import gaussian
 from diffabs.tune.identify.table import Table
+from experiments._shared.numbers import SEARCH_TOLERANCE, store_numbers
 from experiments.identification.figures import UNITS, draw_curves, draw_residuals
 
 PATHS = ("plant.inertia", "plant.road.B", "plant.road.C", "plant.road.D", "plant.road.E")
@@ -294,4 +295,4 @@ def main(config: Config | None = None) -> dict[str, Any]:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main()
+    store_numbers(__file__, main(), SEARCH_TOLERANCE)

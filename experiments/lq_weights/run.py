@@ -30,6 +30,7 @@ from diffabs.tune import Method, Stopping, Tuned, tune
 from diffabs.tune.problem import Problem
 from diffabs.tune.weights import LQWeights
 from experiments._shared.entry import run_part
+from experiments._shared.numbers import store_numbers
 from experiments.lq_weights import searches, second_order
 from experiments.lq_weights.problems import NAMES, Config, box, problems
 
@@ -196,4 +197,11 @@ def main(config: Config | None = None, names: tuple[str, ...] = NAMES) -> dict[s
 
 
 if __name__ == "__main__":
-    run_part({"searches": lambda names: main(names=tuple(names) or NAMES), "second-order": second_order.main})
+
+    def run_searches(names: list[str]) -> None:
+        """Run the searches, and store the numbers of the page if they are of all problems."""
+        results = main(names=tuple(names) or NAMES)
+        if not names:
+            store_numbers(__file__, results, 1e-2)
+
+    run_part({"searches": run_searches, "second-order": second_order.main})

@@ -49,6 +49,7 @@ from diffabs.parts.sensors import EncoderSlip
 from diffabs.parts.stops import SpeedReached
 from diffabs.scenario.defaults import braking
 from diffabs.tune.identify import Identified
+from experiments._shared.numbers import store_numbers
 
 HALF = 1.5  # s; experiment 1 lasts 3 s
 # Ten starts: brakes (torque [N m], rate of the lag [1/s]) with two pairs of dead times each.
@@ -509,4 +510,6 @@ if __name__ == "__main__":
     options = parser.parse_args()
     if unknown := [name for name in options.parts if name not in PARTS]:
         parser.error(f"PART = {unknown[0]!r} is unknown; known are {', '.join(PARTS)}")
-    main(Config(data=options.data, parts=tuple(options.parts)))
+    results = main(Config(data=options.data, parts=tuple(options.parts)))
+    for name in PARTS.keys() & results.keys() if options.data is None else ():
+        store_numbers(__file__, {"rows": results[name]}, 1e-2, name)

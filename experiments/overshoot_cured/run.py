@@ -38,6 +38,7 @@ from diffabs.robust.design.state_feedback import feedback_gain
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import load
 from diffabs.tune import AtMost, CertifiedDecay, Method, Stopping, Tuned, build_problem, grid, tune
+from experiments._shared.numbers import SEARCH_TOLERANCE, store_numbers
 from experiments._shared.statistics import kept
 from experiments.overshoot_cured.figures import figures
 from experiments.overshoot_cured.weak_spots import Box, torques, weak_spots
@@ -288,4 +289,5 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main(progress=lambda p: print(f"round {p.round}: objective {p.point.objective:.6g}", end="\r"))
+    results = main(progress=lambda p: print(f"round {p.round}: objective {p.point.objective:.6g}", end="\r"))
+    store_numbers(__file__, results, SEARCH_TOLERANCE)

@@ -34,6 +34,7 @@ from diffabs.parts.sensors import Noise
 from diffabs.parts.stops import Standstill
 from diffabs.scenario.defaults import braking
 from diffabs.tune import Method, Stopping, Tuned, build_problem, tune
+from experiments._shared.numbers import SEARCH_TOLERANCE, store_numbers
 from experiments._shared.roads import Family, Roads, family
 from experiments._shared.statistics import interval, kept
 
@@ -228,4 +229,5 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    main(progress=lambda p: print(f"{p.point.evaluations} gradients: objective {p.point.objective:.6f}"))
+    results = main(progress=lambda p: print(f"{p.point.evaluations} gradients: objective {p.point.objective:.6f}"))
+    store_numbers(__file__, results, SEARCH_TOLERANCE)

@@ -20,6 +20,7 @@ from diffabs import Loop
 from diffabs.papers import record
 from diffabs.tune import Tuned
 from experiments._shared.entry import run_part, with_times
+from experiments._shared.numbers import store_parts
 from experiments.real_rig import again
 from experiments.real_rig.box import ESTIMATED, KNOWN, Box, Fixed
 from experiments.real_rig.document import document
@@ -208,4 +209,5 @@ def described(stages: dict[str, Tuned]) -> dict[str, Any]:
 
 if __name__ == "__main__":
     report = with_times()
-    run_part({"tune": lambda _: main(progress=report), "again": lambda _: again.main(progress=report)})
+    parts = {"tune": lambda: main(progress=report), "again": lambda: again.main(progress=report)}
+    run_part(store_parts(__file__, parts))

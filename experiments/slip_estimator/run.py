@@ -6,8 +6,9 @@ python experiments/slip_estimator/run.py changing-road      an edge to another s
 """
 
 from experiments._shared.entry import run_part
+from experiments._shared.numbers import store_parts
 from experiments.slip_estimator import changing_road, noise, sampled
 
 if __name__ == "__main__":
-    parts = {"sampled": sampled, "noise": noise, "changing-road": changing_road}
-    run_part({name: lambda _, module=module: module.main() for name, module in parts.items()})
+    parts = {"sampled": sampled.main, "noise": noise.main, "changing-road": changing_road.main}
+    run_part(store_parts(__file__, parts))

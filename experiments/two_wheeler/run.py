@@ -6,8 +6,9 @@ python experiments/two_wheeler/run.py codesign      arm, mount, motor, gear and 
 """
 
 from experiments._shared.entry import run_part
+from experiments._shared.numbers import store_parts
 from experiments.two_wheeler import codesign, lqg, weights
 
 if __name__ == "__main__":
-    parts = {"weights": weights, "lqg": lqg, "codesign": codesign}
-    run_part({name: lambda _, module=module: module.main() for name, module in parts.items()})
+    parts = {"weights": weights.main, "lqg": lqg.main, "codesign": codesign.main}
+    run_part(store_parts(__file__, parts))

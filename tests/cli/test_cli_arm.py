@@ -56,7 +56,7 @@ def test_every_column_has_its_unit(falling):
     angles = [f"{name} [rad]" for name in ("theta", "psi", "phi")]
     rates = [f"{name}_rate [rad/s]" for name in ("theta", "psi", "phi")]
     assert header[:7] == ["t [s]", *angles, *rates]
-    assert header[-3:] == ["target [rad]", "command [V]", "control [V]"]
+    assert header[-5:] == ["target [rad]", "setpoint [rad]", "feedforward [V]", "command [V]", "control [V]"]
     first, last = (dict(zip(header, map(float, row), strict=True)) for row in (rows[0], rows[-1]))
     assert (first["theta [rad]"], first["phi [rad]"], first["psi [rad]"]) == (0.5, 0.2, 0.0)
     assert last["theta [rad]"] == pytest.approx(math.pi / 2, abs=1e-9)

@@ -10,7 +10,11 @@ from project import ROOT
 from experiments._shared import numbers
 
 STUDIES = ROOT / "experiments"
-QUICK = ("lab_rig", "mean_intervals")  # take one to three minutes each; the others up to hours
+QUICK = {  # parts that take up to three minutes each on an idle machine; the others take up to hours
+    "lab_rig": {"": "run"},
+    "mean_intervals": {"": "run"},
+    "slip_estimator": {"sampled": "sampled", "changing-road": "changing_road"},
+}
 
 
 def test_a_number_beyond_the_tolerance_is_named(tmp_path):
@@ -26,6 +30,16 @@ def test_a_number_beyond_the_tolerance_is_named(tmp_path):
     assert json.loads(path.read_text())["tolerance"] == numbers.TOLERANCE
 
 
+def test_each_part_of_a_study_keeps_its_numbers(tmp_path):
+    parts = {"b": lambda: {"x": 1.0}, "a": lambda: {"x": 2.0}}
+    for run in numbers.store_parts(str(tmp_path / "run.py"), parts).values():
+        run([])
+    path = tmp_path / numbers.FILE
+    assert json.loads(path.read_text())["tables"] == {"a": {"x": 2.0}, "b": {"x": 1.0}}
+    assert numbers.find_differences(path, {"x": 2.001}, "a") == []
+    assert numbers.find_differences(path, {"x": 2.001}, "b") == ["x: 1.0 in the file, 2.001 here"]
+
+
 @pytest.mark.parametrize("name", [folder.parent.name for folder in sorted(STUDIES.glob(f"*/{numbers.FILE}"))])
 def test_numbers_have_tables_and_a_tolerance(name):
     stored = json.loads((STUDIES / name / numbers.FILE).read_text())
@@ -35,9 +49,66 @@ def test_numbers_have_tables_and_a_tolerance(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", QUICK)
-def test_a_study_prints_the_numbers_of_its_file(name, tmp_path):
+@pytest.mark.parametrize(("name", "part"), [(name, part) for name, parts in QUICK.items() for part in parts])
+def test_a_study_prints_the_numbers_of_its_file(name, part, tmp_path):
     pytest.importorskip("matplotlib")
-    study = importlib.import_module(f"experiments.{name}.run")
+    study = importlib.import_module(f"experiments.{name}.{QUICK[name][part]}")
     results = study.main(dataclasses.replace(study.Config(), out=str(tmp_path)))
-    assert numbers.find_differences(STUDIES / name / numbers.FILE, results) == []
+    assert numbers.find_differences(STUDIES / name / numbers.FILE, results, part) == []
+
+
+def critical_lags(tables):
+    return {row["at"]: [f"{row['formula [ms]']:.3g} ms"] for row in tables["critical_lag"] if row["at"] != "20 km/h"}
+
+
+def coverages(tables):
+    laws = {
+        "log-normal, sigma 1": "log-normal, deviation 1 of the logarithm",
+        "exponential": "exponential",
+        "log-normal, sigma 0.5": "log-normal, deviation 0.5 of the logarithm",
+        "gamma, shape 4": "gamma, shape 4",
+        "log-normal, sigma 1.5": "log-normal, deviation 1.5 of the logarithm",
+    }
+    return {
+        words: [f"{row['ours [%]']:.0f} %" for row in tables["rows"] if row["law"] == law]
+        for law, words in laws.items()
+    }
+
+
+def two_digits(percent):
+    return f"{percent:#.2g}".rstrip(".") + " %"
+
+
+def distances_behind_an_edge(tables):
+    names, tables = {"proposed, latch": "latch", "conventional, slip 0.2": "fixed slip of 0.2"}, tables["changing-road"]
+    places = {row["place of the peak"]: row for row in tables["by place"]}
+    rows = {}
+    for row in tables["table"]:
+        at_one, further = (two_digits(places[place][row["rule"]]) for place in (1.0, 1.7))
+        only = "" if row["rule"] != "proposed, latch" else at_one
+        rows[names[row["rule"]]] = [two_digits(row["mean [%]"]), f"{row['worst [%]']:.0f} %", only, further]
+    return rows
+
+
+def recovered_by_two_angles(tables):
+    shares = ("95 % of the seeds", "half of the seeds")
+    columns = {"multiple": "every seed recovers up to", **dict(zip(shares, shares, strict=True))}
+    rows = tables["lqg"]["table"][1:]
+    return {words: [f"{row[column]:.3f}" for row in rows] for column, words in columns.items()}
+
+
+@pytest.mark.parametrize(
+    ("name", "printed"),
+    [
+        ("lab_rig", critical_lags),
+        ("mean_intervals", coverages),
+        ("slip_estimator", distances_behind_an_edge),
+        ("two_wheeler", recovered_by_two_angles),
+    ],
+)
+def test_the_table_of_a_page_has_the_numbers_of_its_file(name, printed):
+    lines = (STUDIES / name / "README.md").read_text(encoding="utf-8").splitlines()
+    rows = [[cell.strip() for cell in line[1:-1].split("|")] for line in lines if line.startswith("|")]
+    page = {cells[0]: cells[1:] for cells in rows}
+    expected = printed(json.loads((STUDIES / name / numbers.FILE).read_text())["tables"])
+    assert {words: page.get(words) for words in expected} == expected
