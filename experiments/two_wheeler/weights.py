@@ -69,7 +69,8 @@ def tuned(config: Config) -> Any:
             free={"log_diagonal": config.q_range, "log_effort": config.effort_range},
             objective={"loss": 1.0},
             over=grid(axes),
-            solver=FixedStep(step=config.tuned_step, duration=config.tuned_duration),
+            # Nearly bang-bang gains slide for a moment along the voltage limit, and would end the search there.
+            solver=FixedStep(step=config.tuned_step, duration=config.tuned_duration, kinks=False),
             measured={"loss": SoftLoss(radius=config.radius, softness=config.softness)},
         ),
         method=Method(stopping=Stopping(iterations=config.iterations)),

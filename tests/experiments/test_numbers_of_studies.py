@@ -97,6 +97,24 @@ def recovered_by_two_angles(tables):
     return {words: [f"{row[column]:.3f}" for row in rows] for column, words in columns.items()}
 
 
+def recovered_by_weights(tables):
+    """The page has the tuned gain in bold."""
+    words = ("Q = I, R = 1", "Q = I, R = 0.01", "diag(1, 100, 1, 1, 1, 1), R = 0.01")
+    rows = tables["weights"]["table"]
+    tuned, weights = rows.pop(), tables["weights"]["weights"]
+    q = ", ".join(f"{value:.{0 if value > 100 else 1 if value > 0.5 else 2}f}" for value in weights["q"])
+    return {
+        name: [f"{100 * row['share of the box']:.1f} %", f"{row['multiple of (.5, 0, .2)']:.3g}", "none"]
+        for name, row in zip(words, rows, strict=True)
+    } | {
+        f"tuned: diag({q}), R = {weights['R']:.2g}": [
+            f"**{100 * tuned['share of the box']:.1f} %**",
+            f"**{tuned['multiple of (.5, 0, .2)']:.3f}**",
+            "**proved**" if tuned["common P over the riders"] == "yes" else "none",
+        ]
+    }
+
+
 @pytest.mark.parametrize(
     ("name", "printed"),
     [
@@ -104,6 +122,7 @@ def recovered_by_two_angles(tables):
         ("mean_intervals", coverages),
         ("slip_estimator", distances_behind_an_edge),
         ("two_wheeler", recovered_by_two_angles),
+        ("two_wheeler", recovered_by_weights),
     ],
 )
 def test_the_table_of_a_page_has_the_numbers_of_its_file(name, printed):
