@@ -20,7 +20,12 @@ class FixedStep:
 
     A kink is an instant at which a comparison of the flow changes. Examples are a limit, the knot of a measured road,
     and a wheel that locks. A step that ends on the kink keeps its order. A step across it is exact to h^2, or to h
-    where a rate jumps. Its derivative is exact to one order less.
+    where a rate jumps, and its derivative to one order less.
+
+    A derivative is that of the computed run. Where steps end on events and kinks, its error falls as h^4, too. A step
+    too long for the fastest part of a run costs the derivative more than the value. A parameter that moves an event
+    changes where the later steps lie in the motion, and so the value's error. The derivative's error is then about the
+    value's error times the derivative of the event's time, divided by h. The guide on derivatives has an example.
 
     See also:
         `Adaptive`: Steps as long as a tolerance allows.

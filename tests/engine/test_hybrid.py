@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
+from scipy.integrate import solve_ivp
 
 import diffabs as d
 from diffabs.core.pytree import param, pytree
@@ -112,6 +114,61 @@ class Ball(System):
         return Numbers((height, jnp.where(hits, -self.bounce * speed, speed)), state.steps + hits)
 
 
+INFLOW, OUTFLOW, END = 1.5, 0.8, 3.0  # m/s, m^(1/2)/s, s
+
+
+@pytree
+class Tanks(System):
+    """Two tanks in a row. A valve closes where the first level rises through `high`, and opens at `low`."""
+
+    high: Any = param(default=1.0, unit="m", free=True)
+    low: Any = param(default=0.7, unit="m")
+
+    changes = eventful = True
+
+    def start(self):
+        return Numbers((jnp.asarray(0.8), jnp.asarray(0.4)), jnp.asarray(1.0))
+
+    def flow(self, t, state, signals):
+        first, second = (OUTFLOW * jnp.sqrt(level) for level in state.x)
+        return (INFLOW * state.steps - first, first - second)
+
+    def margins(self, t, state, signals, flow):
+        level = state.x[0]
+        return {"stop": (1.0 + 0.0 * t,), "closes": (self.high - level,), "opens": (level - self.low,)}
+
+    def change(self, clock, state, before, margins, fired, passed=None):
+        return state._replace(steps=jnp.where(fired["closes"][0], 0.0, jnp.where(fired["opens"][0], 1.0, state.steps)))
+
+
+def levels(high, low, step):
+    """Return both levels at the end, shape (2,)."""
+    return jnp.array(run_system(Tanks(high=high, low=jnp.asarray(low)), d.FixedStep(step, END), last_state).x)
+
+
+def levels_by_scipy(high, low):
+    t, x, is_open = 0.0, np.array([0.8, 0.4]), 1.0
+    while t < END:
+
+        def flow(t, x, is_open=is_open):
+            first, second = OUTFLOW * np.sqrt(x)
+            return is_open * INFLOW - first, first - second
+
+        def margin(t, x, is_open=is_open):
+            return high - x[0] if is_open else x[0] - low
+
+        margin.terminal, margin.direction = True, -1
+        part = solve_ivp(flow, (t, END), x, method="DOP853", rtol=1e-13, atol=1e-14, events=margin)
+        t, x, is_open = part.t[-1], part.y[:, -1], 1.0 - is_open
+    return x
+
+
+def slope_by_differences(function, at, width):
+    """Return df/dx by the central difference of fourth order."""
+    near, far = (function(at + n * width) - function(at - n * width) for n in (1, 2))
+    return np.asarray(8.0 * near - far) / (12.0 * width)
+
+
 def last_state(system, objectives, carry):
     return carry.point.state, None
 
@@ -148,3 +205,32 @@ def test_a_ball_bounces_and_has_derivatives(solver):
     slope = (exact(9.81 + 1e-6) - exact(9.81 - 1e-6)) / 2e-6
     np.testing.assert_allclose(jax.grad(height)(g), slope, rtol=1e-5)
     np.testing.assert_allclose(jax.jvp(height, (g,), (1.0,))[1], slope, rtol=1e-5)
+
+
+@pytest.mark.slow
+@killed_by("engine.step.advance", "carry.since + request.h", "carry.since + jax.lax.stop_gradient(request.h)")
+def test_a_derivative_by_the_place_of_events_has_the_order_of_the_method():
+    """Over eight switching levels, because the error depends on where in its step an event lies."""
+    highs, low = jnp.linspace(0.92, 1.06, 8), 0.7
+    values = np.array([levels_by_scipy(high, low) for high in highs])
+    slopes = np.array([slope_by_differences(lambda x: levels_by_scipy(x, low), high, 1e-4) for high in highs])
+
+    def errors(step):
+        run = jax.vmap(lambda high: jax.jvp(lambda x: levels(x, low, step), (high,), (1.0,)))
+        return [np.sqrt(np.mean((ours - exact) ** 2)) for ours, exact in zip(run(highs), (values, slopes), strict=True)]
+
+    coarse, middle, fine = (np.array(errors(step)) for step in (0.04, 0.02, 0.01))
+    orders = np.log2([coarse / middle, middle / fine])
+    assert np.all(orders > 3.3), orders
+
+
+@pytest.mark.slow
+def test_a_coarse_step_has_the_derivative_of_its_own_run():
+    """Few steps pass the low level, where the outflow changes fast. Their place decides on the error of the run."""
+    low, step = 1e-3, 0.01
+    value, slope = jax.jvp(lambda high: levels(high, low, step), (jnp.asarray(1.0),), (1.0,))
+    own = slope_by_differences(lambda high: levels(jnp.asarray(high), low, step), 1.0, 2e-6)
+    exact = slope_by_differences(lambda high: levels_by_scipy(high, low), 1.0, 1e-5)
+    np.testing.assert_allclose(value, levels_by_scipy(1.0, low), rtol=3e-5)
+    np.testing.assert_allclose(slope, own, rtol=1e-7)
+    assert np.all(np.abs(slope - exact) > 1e-4)
