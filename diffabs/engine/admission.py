@@ -149,7 +149,7 @@ def read_solver(
         raise ValueError("; ".join(lines).replace("solver.duration =", "t1 - t0 ="))
     if isinstance(solver, FixedStep):
         count = solver.steps
-        solver = FixedStep(1.0 / count, 1.0, kinks=True)
+        solver = FixedStep(1.0 / count, 1.0, kinks=True, follow_slides=solver.follow_slides)
     method = dataclasses.replace(build_stepping(solver, dtype), watches=True)
     return dataclasses.replace(method, keeps_mode=True) if isinstance(method, AdaptiveStepping) else method, count
 

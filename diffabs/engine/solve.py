@@ -180,7 +180,7 @@ def solve(
     if not switched:
         adaptive = isinstance(method, AdaptiveStepping)
         lean = {"keeps_mode": False, "stable": False} if adaptive else {"kinks": False}
-        method = dataclasses.replace(method, watches=False, smooth=True, **lean)
+        method = dataclasses.replace(method, watches=False, smooth=True, follows=False, **lean)
     saves = {} if save_objective is None else {"saves": save_objective}
 
     room = count if isinstance(method, FixedStepping) else log_capacity(system, any_solver)

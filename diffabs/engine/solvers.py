@@ -64,6 +64,10 @@ class FixedStep:
     """True if steps end on kinks, which costs up to twice as much time; False if they do not. None means True for
     derivatives, and for values only if a rate jumps at a kink (conditional integration).
     """
+    follow_slides: bool = False
+    """True if a run that slides along a switching surface, because the rates of both sides push onto it, follows the
+    surface and has derivatives. Such a run has steps that end on kinks. False reports it: see `Run.slid`.
+    """
 
     @property
     def steps(self) -> int:
@@ -119,6 +123,10 @@ class Adaptive:
     """
     every: int = 1
     """A trajectory keeps every `every`-th instant of the grid, by interpolation."""
+    follow_slides: bool = False
+    """True if a run that slides along a switching surface, because the rates of both sides push onto it, follows the
+    surface and has derivatives. Such a run has steps that end on kinks. False reports it: see `Run.slid`.
+    """
 
     @property
     def steps(self) -> int:
@@ -148,9 +156,11 @@ def refine_solver(solver: Solver, times: int) -> Solver:
 def describe_solver(solver: Solver) -> dict[str, PyTree]:
     """Return the fields of a solver that decide the metrics, by name, as JSON values: step and duration [s].
 
-    `Adaptive` adds its type and `rtol`, `FixedStep` its `kinks` unless they are None.
+    `Adaptive` adds its type and `rtol`, `FixedStep` its `kinks` unless they are None; both add `follow_slides` if True.
     """
-    fields = {"step": solver.step, "duration": solver.duration}
+    fields: dict[str, PyTree] = {"step": solver.step, "duration": solver.duration}
+    if solver.follow_slides:
+        fields["follow_slides"] = True
     if isinstance(solver, Adaptive):
         return fields | {"type": "adaptive", "rtol": solver.rtol}
     return fields if solver.kinks is None else fields | {"kinks": solver.kinks}
@@ -159,8 +169,8 @@ def describe_solver(solver: Solver) -> dict[str, PyTree]:
 def find_solver_faults(solver: Solver) -> list[str]:
     """Return one line for each fault of a solver, independent of the loop; an empty list if there is none.
 
-    `kinks` must be True, False or None. Each other field must be a positive, finite number, `rtol` below 1. The step
-    must not be longer than the duration. At most `MAX_SOLVER_STEPS` steps are allowed.
+    `kinks` must be True, False or None, `follow_slides` True or False. Each other field must be a positive, finite
+    number, `rtol` below 1. The step must not be longer than the duration. At most `MAX_SOLVER_STEPS` steps are allowed.
     """
     if not isinstance(solver, FixedStep | Adaptive):
         solvers = "d.FixedStep(step=..., duration=...) or d.Adaptive(rtol=..., duration=...)"
@@ -171,6 +181,10 @@ def find_solver_faults(solver: Solver) -> list[str]:
     kinks = getattr(solver, "kinks", None)
     if not (kinks is None or isinstance(kinks, bool)):
         return [f"solver.kinks = {kinks!r} is not a Python bool; True, False or None is needed"]
+    if not isinstance(solver.follow_slides, bool):
+        return [f"solver.follow_slides = {solver.follow_slides!r} is not a Python bool; True or False is needed"]
+    if solver.follow_slides and kinks is False:
+        return ["solver.kinks = False: a run follows a switching surface only with steps that end there; leave it out"]
     step, duration = solver.step, solver.duration
     if step > duration:
         return [

@@ -22,8 +22,8 @@ from diffabs.loop.result import Run
 
 FRAMES_OF_A_COMPARISON = 6  # calls that are read to find the line that compares, from the innermost one on
 SLIDE_ADVICE = (
-    "make the jump continuous over a small band (jnp.tanh(x / band)), give the switch a hysteresis by an event, or use"
-    " Clamping or BackCalculation for an integral at a limit"
+    "give the solver follow_slides=True, make the jump continuous over a small band (jnp.tanh(x / band)), give the"
+    " switch a hysteresis by an event, or use Clamping or BackCalculation for an integral at a limit"
 )
 
 

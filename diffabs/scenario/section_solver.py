@@ -22,6 +22,7 @@ class _Any:
     step: float = table_field(range_reader(TIME_SPEC), FixedStep.step)
     duration: float = table_field(range_reader(TIME_SPEC), FixedStep.duration)
     every: int = table_field(whole_reader(1, int(MAX_SOLVER_STEPS)), FixedStep.every)
+    follow_slides: bool = table_field(read_switch, False)
     seed: int = table_field(whole_reader(0, 2**32 - 1), 0)
 
 
@@ -58,4 +59,6 @@ def write_solver_section(solver: Solver, seed: int) -> JsonObject:
     """Return the section that `read_solver_section` reads back to the same solver and seed."""
     kind = next(name for name, cls in SOLVER_TYPES.items() if type(solver) is cls)
     fields = {name: value for name, value in plain_fields(solver).items() if value is not None}
+    if not solver.follow_slides:
+        del fields["follow_slides"]
     return {"type": kind, **fields, "seed": seed}

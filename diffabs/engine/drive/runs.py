@@ -68,8 +68,9 @@ def build_stepping(solver: Solver, dtype: DTypeLike) -> FixedStepping | Adaptive
     # `device_put` instead of `jnp.asarray`, which would compile a program.
     h, steps = number(float(solver.step), dtype), jax.device_put(solver.steps)
     if isinstance(solver, Adaptive):
-        return AdaptiveStepping(h, steps, number(float(clip_rtol(np.asarray(solver.rtol, dtype))), dtype))
-    return FixedStepping(h, steps, solver.kinks)
+        rtol = number(float(clip_rtol(np.asarray(solver.rtol, dtype))), dtype)
+        return AdaptiveStepping(h, steps, rtol, keeps_mode=solver.follow_slides, follows=solver.follow_slides)
+    return FixedStepping(h, steps, True if solver.follow_slides else solver.kinks, follows=solver.follow_slides)
 
 
 def run_system(

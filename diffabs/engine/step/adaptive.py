@@ -49,7 +49,7 @@ from diffabs.engine.step.event_location import (
 )
 from diffabs.engine.step.outlook import look_ahead, margin_error, watch_margins
 from diffabs.engine.step.runge_kutta import TSIT5, midpoint_error
-from diffabs.engine.step.slides import begin_slide, has_slid, slide_of
+from diffabs.engine.step.slides import begin_slide, ended_slide, has_slid, slide_of
 from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.step_size import (
     INITIAL_STEP_S,
@@ -167,7 +167,7 @@ class AdaptiveReport(NamedTuple):
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["h", "steps", "rtol"],
-    meta_fields=["keeps_last_step", "keeps_mode", "watches", "smooth", "stable"],
+    meta_fields=["keeps_last_step", "keeps_mode", "watches", "smooth", "stable", "follows"],
 )
 @dataclasses.dataclass(frozen=True)
 class AdaptiveStepping:
@@ -183,6 +183,7 @@ class AdaptiveStepping:
             steps keep to a mode.
         smooth: True if nothing switches and no event can happen.
         stable: True if stability limits a step, too. The error of a run at rest shows no derivative that grows.
+        follows: True if a run follows the surface along which it slides. Its steps keep to a mode.
     """
 
     h: Array
@@ -193,6 +194,7 @@ class AdaptiveStepping:
     watches: bool = False
     smooth: bool = False
     stable: bool = True
+    follows: bool = False
     tableau, has_margin_rates, second_order = TSIT5, True, False
     step = advance
 
@@ -210,7 +212,7 @@ class AdaptiveStepping:
     def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `hybrid`, `objectives` and random `key`."""
         error_limited = jnp.minimum(INITIAL_STEP_S, self.h * self.steps) + 0.0 * self.h
-        foresee = partial(self._look_ahead, error_limited, jnp.asarray(False), jnp.asarray(True))
+        foresee = partial(self._look_ahead, error_limited, jnp.asarray(False), jnp.asarray(True), -1)
         carry = start_carry(self, hybrid, objectives, key, foresee)
         point, zero, no = carry.point, carry.k, carry.unrestricted
         state = borrow(point.state, None)
@@ -278,7 +280,7 @@ class AdaptiveStepping:
         A step that keeps its mode gets `CROSSING_OVERREACH` times this time, so that the change lies within it.
         """
         fresh = (carry.status == RunStatus.REFRESHING) | carry.unrestricted
-        return self._look_ahead(carry.control.error_limited, carry.unrestricted, fresh, dynamics)
+        return self._look_ahead(carry.control.error_limited, carry.unrestricted, fresh, ended_slide(carry), dynamics)
 
     def report(
         self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: HybridState, error: PyTree
@@ -369,8 +371,8 @@ class AdaptiveStepping:
         elif watch:
             score = jnp.maximum(crossings + jnp.where(report.returns >= 0, RETURN_SCORE, -1), 0)
             crossings = jnp.where(accepted, score, crossings)
-            slide = begin_slide(watch.slide, crossings >= MAX_RETURN_SCORE, report.returns, after.point.t)
-            after = after._replace(slides=watch._replace(slide=slide))
+            slide = begin_slide(watch.lost, crossings >= MAX_RETURN_SCORE, report.returns, after.point.t)
+            after = after._replace(slides=watch._replace(lost=slide))
         # A landing with invalid numbers is no landing: the step is attempted again, and its event located again.
         status = jnp.where(~accepted & ~searches & (status == RunStatus.LANDING), RunStatus.RUNNING, status)
         refreshes = status == RunStatus.REFRESHING
@@ -419,11 +421,13 @@ class AdaptiveStepping:
         """Return the predicted time [s] to the first change of an answer."""
         return jnp.full_like(self.h, jnp.inf) if self.smooth else point.forecast[0]
 
-    def _look_ahead(self, error_limited: Scalar, unrestricted: Bool, fresh: Bool, dynamics: Evaluation) -> PyTree:
+    def _look_ahead(
+        self, error_limited: Scalar, unrestricted: Bool, fresh: Bool, ended: PyTree, dynamics: Evaluation
+    ) -> PyTree:
         """Return the forecast, nothing if `smooth`; `fresh` is True if the answers are new."""
         if self.smooth:
             return ()
-        outlook = look_ahead(fresh, self._select_watched(dynamics))
+        outlook = look_ahead(fresh, ended, self._select_watched(dynamics))
         ahead = self._forecast_crossing(error_limited, unrestricted, dynamics), outlook
         return ahead if self.keeps_mode else (*ahead, find_imminent(dynamics.surfaces, error_limited))
 

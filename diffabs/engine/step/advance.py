@@ -29,7 +29,7 @@ from diffabs.engine.step.attempt import (
     attempt_step,
     commit_step,
     evaluate_point,
-    flip_answer,
+    flip_answers,
     mode_after_changes,
     mode_in_step,
     start_state,
@@ -42,9 +42,18 @@ from diffabs.engine.step.event_location import (
     find_crossings,
     init_search,
 )
-from diffabs.engine.step.modes import Mode
+from diffabs.engine.step.modes import Mode, single_bit
 from diffabs.engine.step.runge_kutta import Tableau
-from diffabs.engine.step.slides import init_watch, watch_landing
+from diffabs.engine.step.slides import (
+    Landing,
+    SlideWatch,
+    along_of,
+    begins_along,
+    init_watch,
+    kept_answers,
+    watch_landing,
+)
+from diffabs.engine.step.sliding_flow import MAX_SURFACES
 from diffabs.engine.step.status import RunStatus, is_running, status_after_step
 from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, Objectives, ObservedSystem, build_system
 
@@ -133,6 +142,11 @@ class Stepping(Protocol):
     @property
     def smooth(self) -> bool:
         """True if nothing switches and no event can happen."""
+        ...
+
+    @property
+    def follows(self) -> bool:
+        """True if a run follows the surface along which it slides."""
         ...
 
     @property
@@ -229,6 +243,14 @@ def advance(
     attempt = barrier(active, attempt_request)
     decision = keep_decision(barrier(active, lambda: stepping.decide(system, carry, request, attempt, active)))
 
+    slides = carry.slides
+    if slides:
+        slides = _watch_slides(stepping, hybrid.ticks, carry, attempt, decision, request)
+        mode = decision.mode
+        if slides.followed:  # a slide begins in the mode of the step: either side's mode serves
+            words = select(begins_along(carry.slides, slides), attempt.point.words, mode.words)
+            mode = mode._replace(words=words, along=slides.followed.along)
+        decision = decision._replace(mode=mode)
     strikes = decision.accepted & request.strikes
     k = jnp.where(strikes, request.strike, carry.k)
     clock = Clock(attempt.point.t, stepping.h, k, key, strikes)
@@ -240,11 +262,7 @@ def advance(
     point = select(decision.over, attempt.point, jit_barrier(active, commit) if hybrid.changes else commit())
     point = select(decision.accepted, point, start)
     since = jnp.where(strikes, 0.0, jnp.where(decision.accepted, carry.since + request.h, carry.since))
-    after = carry._replace(point=point, k=k, since=since)
-    if carry.slides:
-        landed, running = decision.crosses_surface, carry.status == RunStatus.RUNNING
-        calm = decision.accepted & running & stepping.is_calm(carry)
-        after = after._replace(slides=watch_landing(carry.slides, carry.search, landed, calm, attempt.point.t))
+    after = carry._replace(point=point, k=k, since=since, slides=slides)
     if stepping.searches:
         after = _search(stepping, system, carry, attempt, decision, after)
     elif stepping.smooth:
@@ -256,6 +274,18 @@ def advance(
     if until is not None:  # without a pause, the other fields of a run that is over have no effect
         after = select(active, after, carry)
     return after._replace(point=after.point._replace(state=borrow(after.point.state, logs)))
+
+
+def _watch_slides(
+    stepping: Stepping, ticks: bool, carry: Carry, attempt: Attempt, decision: Decision, request: StepRequest
+) -> SlideWatch:
+    """Return the watch for slides after an attempt."""
+    calm = decision.accepted & (carry.status == RunStatus.RUNNING) & stepping.is_calm(carry)
+    reset = reduce(jnp.logical_or, jax.tree.leaves(decision.triggered))
+    if ticks:  # a block may have changed
+        reset |= decision.accepted & request.strikes
+    landed, words, t = decision.crosses_surface, carry.point.words, attempt.point.t
+    return watch_landing(carry.slides, Landing(carry.search, words, landed, calm, reset, t))
 
 
 def _search(
@@ -307,7 +337,10 @@ def start_carry(
     status = jnp.where(point.margins["stop"][0] > 0, zero + RunStatus.RUNNING, zero + RunStatus.MISSED)
     point = point._replace(state=borrow(state, logs))
     search, yes, no = init_search(stepping.h), jnp.asarray(True), jnp.asarray(False)
-    slides = init_watch(system.word_count, none) if system.bit_count and stepping.searches else ()
+    slides = ()
+    if system.bit_count and stepping.searches:
+        surfaces = min(system.bit_count, MAX_SURFACES) if stepping.follows else 0
+        slides = init_watch(system.word_count, surfaces, none)
     return Carry(point, zero, none, stepping.h, yes, stepping.h, search, no, slides, (), status)
 
 
@@ -318,9 +351,12 @@ def propose_step(stepping: Stepping, system: ObservedSystem, carry: Carry, strik
     """
     refresh, mode = carry.status == RunStatus.REFRESHING, UNCONSTRAINED
     if frozen:
-        number, words = carry.search.number, carry.point.words
-        beyond = mode_after_changes(system, words, number, number < system.bit_count)
+        words = carry.point.words
+        beyond = mode_after_changes(
+            words, kept_answers(carry, system.word_count), carry.search.number < system.bit_count
+        )
         mode = select(refresh, beyond, mode_in_step(system, words, carry.unrestricted))
+        mode = mode._replace(along=along_of(carry))
     end = jnp.where(carry.strikes, strike * stepping.h, carry.point.t + carry.length)
     return StepRequest(carry.length, end, stepping.h, mode, refresh, carry.strikes, strike)
 
@@ -361,8 +397,14 @@ def decide_attempt(
     lands, mode = jnp.asarray(False), UNCONSTRAINED
     if frozen:
         lands = accepted & landing & (number < bit_count)
-        words = flip_answer(system, attempt.point.words, number, lands)
-        mode = mode_after_changes(system, words, number, lands)
+        # A slide ends with the answer of the side whose share has become 1.
+        along = along_of(carry)
+        kept = flips = single_bit(number, system.word_count)
+        for surface, share in zip(along, attempt.shares, strict=True):
+            ends, none = surface.number == number, tuple(jnp.zeros_like(word) for word in flips)
+            flips = select(ends, select(share > 0.5, surface.answers, none), flips)
+            kept = select(ends, surface.answers, kept)
+        mode = mode_after_changes(flip_answers(attempt.point.words, flips, lands), kept, lands)
     return Decision(valid, accepted, searches, lands, triggered, mode, over)
 
 

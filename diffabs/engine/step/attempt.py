@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.cubic import HermiteStep
-from diffabs.core.lanes import select
+from diffabs.core.lanes import any_lane, select
 from diffabs.core.log import borrow
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment
 from diffabs.core.types import Any, Array, Bool, Int, PyTree, Scalar
 from diffabs.engine.hybrid import HybridSignals, HybridState, HybridSystem, Margins, Objectives
-from diffabs.engine.step.modes import Mode, ModeBits, single_bit
-from diffabs.engine.step.runge_kutta import Tableau, runge_kutta_step
+from diffabs.engine.step.modes import Mode, ModeBits
+from diffabs.engine.step.runge_kutta import Tableau, runge_kutta_scan, runge_kutta_step
 from diffabs.engine.step.surfaces import valid_end_rates
 from diffabs.engine.step.system import (
     Accumulators,
@@ -93,12 +93,14 @@ class Attempt(NamedTuple):
         point: The end, before the changes there.
         signals: Signals of the system.
         shift: Time [s] by which the end lies later than requested.
+        shares: Shares of the other answer along each surface; () if the run cannot slide (`sliding_flow`).
         report: What the stepping method needs for its decision.
     """
 
     point: Point
     signals: HybridSignals
     shift: Scalar
+    shares: tuple[Scalar, ...]
     report: PyTree
 
 
@@ -142,7 +144,15 @@ def attempt_step(
     def flow(t: Scalar, z: object, constants: tuple[PyTree, Mode]) -> PyTree:
         return system.rates(t, z, *constants)
 
-    z, error = runge_kutta_step(tableau, flow, point.t, z, point.rates, h, (held, mode))
+    def integrate() -> tuple[PyTree, PyTree]:
+        return runge_kutta_step(tableau, flow, point.t, z, point.rates, h, (held, mode))
+
+    def integrate_slide() -> tuple[PyTree, PyTree]:
+        rates = lambda t, z: system.sliding_rates(t, z, held, mode)  # noqa: E731
+        end, error = runge_kutta_scan(tableau, rates, point.t, z, point.rates, h)
+        return system.return_to_surfaces(t, end, held, mode), error
+
+    z, error = jax.lax.cond(any_lane(mode.slides), integrate_slide, integrate) if mode.along else integrate()
     shift = jnp.zeros_like(h)
     if request.shift_end:
         dynamics = system.evaluate(t, *with_flow(point.state, point.accumulators, z), mode)
@@ -174,7 +184,7 @@ def attempt_step(
         # A step of length 0 must not count twice in the objectives.
         updated = select(request.refresh, point.accumulators, updated)
     end = _build_point(dynamics, t, projected, updated, forecast)
-    return Attempt(end, dynamics.signals, shift, report(dynamics, state, error))
+    return Attempt(end, dynamics.signals, shift, dynamics.shares, report(dynamics, state, error))
 
 
 def commit_step(
@@ -217,19 +227,17 @@ def mode_in_step(system: ObservedSystem, words: ModeBits, free: Bool) -> Mode:
     return Mode(words, free, tuple(jnp.where(free, all, none) for _ in range(system.word_count)))
 
 
-def mode_after_changes(system: ObservedSystem, words: ModeBits, number: Array, lands: Bool) -> Mode:
+def mode_after_changes(words: ModeBits, kept: ModeBits, lands: Bool) -> Mode:
     """Return the mode in which the dynamics are evaluated after the changes at the end of a step.
 
-    If it `lands` on the switching surface of a comparison, that one keeps its answer in `words`, those of
-    `flip_answer`: at the zero of its margin, rounding could turn it back. All others are evaluated.
+    If it `lands` on a switching surface, the bits `kept` keep their answers in `words`: at the zero of a margin,
+    rounding could turn them back. All others are evaluated.
     """
-    frozen = (jnp.where(lands, bit, jnp.uint32(0)) for bit in single_bit(number, system.word_count))
-    return Mode(words, ~lands, tuple(~bit for bit in frozen))
+    return Mode(words, ~lands, tuple(~jnp.where(lands, bits, jnp.uint32(0)) for bits in kept))
 
 
-def flip_answer(system: ObservedSystem, words: ModeBits, number: Array, lands: Bool) -> ModeBits:
-    """Return the answers with that of one comparison reversed where a step `lands` on its switching surface."""
-    bits = single_bit(number, system.word_count)
+def flip_answers(words: ModeBits, bits: ModeBits, lands: Bool) -> ModeBits:
+    """Return the answers with these bits reversed where a step `lands` on the switching surface between them."""
     return tuple(word ^ jnp.where(lands, bit, jnp.uint32(0)) for word, bit in zip(words, bits, strict=True))
 
 

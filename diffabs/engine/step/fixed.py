@@ -31,7 +31,7 @@ from diffabs.engine.step.attempt import Attempt, StepRequest
 from diffabs.engine.step.event_location import MAX_LOCATION_ATTEMPTS, SurfaceCrossing, find_surface_crossing
 from diffabs.engine.step.outlook import look_ahead, watch_margins
 from diffabs.engine.step.runge_kutta import RK4
-from diffabs.engine.step.slides import begin_slide
+from diffabs.engine.step.slides import begin_slide, ended_slide
 from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, Objectives, ObservedSystem
 
@@ -71,7 +71,7 @@ class FixedStepReport(NamedTuple):
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["h", "steps"],
-    meta_fields=["kinks", "second_order", "watches", "smooth"],
+    meta_fields=["kinks", "second_order", "watches", "smooth", "follows"],
 )
 @dataclasses.dataclass(frozen=True)
 class FixedStepping:
@@ -84,6 +84,7 @@ class FixedStepping:
         second_order: True if the times of events have second derivatives.
         watches: True if the run ends where it slides or grazes. It must locate switching surfaces.
         smooth: True if nothing switches and no event can happen. Then each attempt is a step to the next instant.
+        follows: True if a run follows the surface along which it slides.
     """
 
     h: Array
@@ -92,6 +93,7 @@ class FixedStepping:
     second_order: bool = False
     watches: bool = False
     smooth: bool = False
+    follows: bool = False
     tableau = RK4
     step = advance
 
@@ -107,7 +109,7 @@ class FixedStepping:
 
     def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `hybrid`, `objectives` and random `key`."""
-        foresee = partial(look_ahead, jnp.asarray(True)) if self.watches else lambda dynamics: ()
+        foresee = partial(look_ahead, jnp.asarray(True), -1) if self.watches else lambda dynamics: ()
         carry = start_carry(self, hybrid, objectives, key, foresee)
         return cast_floats(carry._replace(control=FixedStepControl(carry.k, carry.k)), self.h.dtype)
 
@@ -158,7 +160,9 @@ class FixedStepping:
 
     def forecast(self, carry: Carry, dynamics: Evaluation) -> PyTree:
         """Return the `Outlook` if the method `watches`, and else nothing."""
-        return look_ahead(carry.status == RunStatus.REFRESHING, dynamics) if self.watches else ()
+        if not self.watches:
+            return ()
+        return look_ahead(carry.status == RunStatus.REFRESHING, ended_slide(carry), dynamics)
 
     def report(
         self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: HybridState, error: object
@@ -179,7 +183,8 @@ class FixedStepping:
         # The rates at the end of a smooth run are used nowhere else but in samples of its last step.
         numbers = jax.tree.leaves((end.state.flow(), end.rates[0] if self.smooth else ()))
         valid = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in numbers]))
-        valid &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True
+        # A run that slides is moved onto its surface, which no rate predicts.
+        valid &= carry.unrestricted | request.mode.slides | _is_plausible(carry, attempt) if system.program else True
         last = request.strikes & (request.strike >= self.steps)
         frozen = system.program is not None
         return decide_attempt(self, system, carry, attempt, active, valid, valid, last=last, frozen=frozen)
@@ -205,8 +210,8 @@ class FixedStepping:
             if watch := after.slides:
                 # So many landings within one step that there is no room for another return.
                 begins = gave_up & crowded & (watch.returns > 0)
-                slide = begin_slide(watch.slide, begins, after.search.number, after.point.t)
-                after = after._replace(slides=watch._replace(slide=slide))
+                slide = begin_slide(watch.lost, begins, after.search.number, after.point.t)
+                after = after._replace(slides=watch._replace(lost=slide))
             becomes_unrestricted = ~decision.accepted & ~unrestricted & (~decision.valid | gave_up)
             unrestricted = (unrestricted | becomes_unrestricted) & ~(on_grid & have_same_answers(carry, attempt))
             status = jnp.where(becomes_unrestricted, RunStatus.RUNNING, status)

@@ -1,6 +1,7 @@
 """Modes: frozen answers to the comparisons of a program (`comparisons`), packed in words, one bit for each."""
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +18,24 @@ ModeBits = tuple[Any, ...]
 BitRange = tuple[int, tuple[int, ...]]  # first bit and shape of a comparison
 
 
+class SlidingSurface(NamedTuple):
+    """A surface along which a run slides.
+
+    Attributes:
+        number: Number of the comparison whose margin is zero there; -1 for none.
+        answers: Bits of all comparisons that answer otherwise on the other side: of this one, and of those that depend
+            on it. Their numbers say nothing on the surface itself.
+    """
+
+    number: Array
+    answers: ModeBits
+
+    @property
+    def exists(self) -> Bool:
+        """True if the run slides along it."""
+        return self.number >= 0
+
+
 class Mode(NamedTuple):
     """Frozen answers to the comparisons of a program.
 
@@ -25,11 +44,18 @@ class Mode(NamedTuple):
         free: True overrides the frozen answers by the answers of the numbers. An evaluation with `look` ignores it,
             except for a search in knots.
         released: Answers that give way where the numbers contradict them. Only an evaluation with `look` reads them.
+        along: Surfaces along which the run slides (`sliding_flow`); () if it cannot slide.
     """
 
     words: ModeBits | None
     free: PyTree = None
     released: ModeBits | None = None
+    along: tuple[SlidingSurface, ...] = ()
+
+    @property
+    def slides(self) -> Bool:
+        """True if the run slides along a surface."""
+        return reduce(jnp.logical_or, [surface.exists for surface in self.along], jnp.asarray(False))
 
 
 class ComparisonAnswers(NamedTuple):

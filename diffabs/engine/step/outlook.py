@@ -15,6 +15,7 @@ from diffabs.core.types import Array, Bool, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState
 from diffabs.engine.step.advance import Carry
 from diffabs.engine.step.attempt import mode_in_step
+from diffabs.engine.step.slides import along_of
 from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.system import Evaluation, ObservedSystem
 
@@ -83,9 +84,17 @@ def find_turns(starts: Outlook, ends: Outlook, length: Scalar, landing: Array) -
     return jax.lax.cond(any_lane(jnp.any(near)), find, lambda: Turns(jnp.zeros_like(length), jnp.asarray(False)))
 
 
-def look_ahead(fresh: Bool, dynamics: Evaluation) -> Outlook:
-    """Return the margins at an instant; it is `fresh` if its numbers have just chosen the mode of the next step."""
+def look_ahead(fresh: Bool, ended: PyTree, dynamics: Evaluation) -> Outlook:
+    """Return the margins at an instant; it is `fresh` if its numbers have just chosen the mode of the next step.
+
+    `ended` is the number of the comparison whose slide ends here, or -1.
+    """
     margins, rates, numbers = _list_margins(dynamics, 0)
+    # A run leaves its surface with the rate 0, whose sign is that of a rounding error.
+    rest = (
+        fresh & (numbers == ended) & (jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(dynamics.margins)))
+    )
+    margins, rates = (jnp.where(rest, 0.0, x) for x in (margins, rates))
     # The margin of a newly chosen answer may have any sign. It is turned so that it is positive within the mode.
     surfaces = jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(dynamics.margins))
     turned = fresh & surfaces & ((margins < 0) | ((margins == 0) & (rates < 0)))
@@ -119,7 +128,9 @@ def margin_error(system: ObservedSystem, carry: PyTree, h: Scalar, dynamics: Eva
     greatest = jnp.maximum(jnp.maximum(jnp.abs(start.margins), jnp.abs(margins)), jnp.abs(middle_margins))
     errors = jnp.abs(Cubic(start.margins, margins, h * start.rates, h * rates)(0.5) - middle_margins)
     errors = jnp.where(jnp.isfinite(errors) & (greatest > 0), errors / jnp.where(greatest > 0, greatest, 1.0), 0.0)
-    return jnp.where(carry.status == RunStatus.RUNNING, jnp.max(errors) / MARGIN_TOLERANCE, 0.0)
+    # Along a surface the margins are those of the shares, which this evaluation does not have.
+    judged = (carry.status == RunStatus.RUNNING) & ~mode._replace(along=along_of(carry)).slides
+    return jnp.where(judged, jnp.max(errors) / MARGIN_TOLERANCE, 0.0)
 
 
 def _outlook(carry: PyTree) -> Outlook:

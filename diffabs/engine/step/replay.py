@@ -29,8 +29,9 @@ from diffabs.engine.solvers import ADAPTIVE_ERROR_ORDER, Adaptive
 from diffabs.engine.step.adaptive import AdaptiveStepping, StateSpan, clip_rtol, span_step
 from diffabs.engine.step.advance import Carry, Decision, advance, cast_floats, start_carry
 from diffabs.engine.step.attempt import Attempt, StepRequest, mode_in_step
-from diffabs.engine.step.modes import ModeBits
+from diffabs.engine.step.modes import ModeBits, SlidingSurface
 from diffabs.engine.step.runge_kutta import TSIT5
+from diffabs.engine.step.slides import along_of, is_return
 from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.system import Evaluation, Objectives, ObservedSystem
 
@@ -55,9 +56,12 @@ class StepLog(NamedTuple):
         triggered: Bit mask of the events at its end.
         words: Mode of the step.
         next_words: Mode of the next step.
+        along: Comparisons along whose surfaces the step slides (`Mode.along`).
+        next_along: Those of the next step.
         unrestricted: True if the step has no mode.
         lands: Number of the comparison that changes at its end, or -1.
-        begins_at_zero: True if it lands on a margin that is zero, with a slope near zero, at its beginning.
+        begins_at_zero: True if it lands on a margin that is zero at its beginning, with a slope near zero or because
+            the run has just landed on the same surface.
         refresh: True for a step of length 0 that evaluates the rates.
         over: True if the run ends there.
     """
@@ -70,6 +74,8 @@ class StepLog(NamedTuple):
     triggered: Int
     words: ModeBits
     next_words: ModeBits
+    along: tuple[SlidingSurface, ...]
+    next_along: tuple[SlidingSurface, ...]
     unrestricted: Bool
     lands: Int
     begins_at_zero: Bool
@@ -100,7 +106,7 @@ class ReplayStepping:
 
     live: AdaptiveStepping
     entry: Any = None
-    tableau, has_margin_rates, searches, smooth, second_order = TSIT5, True, False, False, False
+    tableau, has_margin_rates, searches, smooth, second_order, follows = TSIT5, True, False, False, False, False
 
     @property
     def h(self) -> Array:
@@ -145,8 +151,9 @@ class ReplayStepping:
         entry, k = self.entry, carry.k
         h = jnp.where(entry.refresh | ~entry.accepted, 0.0, entry.length - carry.control.delay)
         end = jnp.where(entry.refresh, carry.point.t, entry.t)
-        words = select(entry.refresh, entry.next_words, entry.words)
-        mode = mode_in_step(system, words, entry.unrestricted)
+        own, next = (entry.words, entry.along), (entry.next_words, entry.next_along)
+        words, along = select(entry.refresh, next, own)
+        mode = mode_in_step(system, words, entry.unrestricted)._replace(along=along)
         strikes = entry.k != k
 
         def shift_end(end: Evaluation) -> Scalar:
@@ -176,7 +183,7 @@ class ReplayStepping:
         entry, no = self.entry, jnp.asarray(False)
         margins, tree = jax.tree.flatten(attempt.point.margins)
         triggered = tree.unflatten([entry.triggered & (1 << i) != 0 for i in range(len(margins))])
-        mode = mode_in_step(system, entry.next_words, no)
+        mode = mode_in_step(system, entry.next_words, no)._replace(along=entry.next_along)
         return Decision(active, active, no, entry.lands >= 0, triggered, mode, entry.over)
 
     def plan_next(
@@ -266,9 +273,11 @@ def log_attempt(old: Carry, new: Carry) -> StepLog:
         triggered=triggered,
         words=old.point.words,
         next_words=new.point.words,
+        along=along_of(old),
+        next_along=along_of(new),
         unrestricted=old.unrestricted,
         lands=lands,
-        begins_at_zero=landing & old.search.at_once & (old.search.fall == 0),
+        begins_at_zero=landing & old.search.at_once & ((old.search.fall == 0) | is_return(old, lands)),
         refresh=old.status == RunStatus.REFRESHING,
         over=~new.running,
     )

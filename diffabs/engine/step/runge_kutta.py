@@ -98,6 +98,13 @@ def midpoint_error(tableau: Tableau, shares: X, last: X, h: Scalar) -> X:
     return jax.tree.map(lambda a, b: h * (a + tableau.midpoint[-1] * b), shares, last)
 
 
+def runge_kutta_scan(
+    tableau: Tableau, derivative: Callable[[Scalar, X], X], t: Scalar, x: X, rate: X, h: Scalar
+) -> tuple[X, X]:
+    """Return the results of `runge_kutta_step` by a scan over the stages: a short program for a costly rate."""
+    return _scanned_step(tableau, derivative, t, x, rate, h, ())
+
+
 # XLA fuses across everything but a loop. With unrolled stages it would compute the tangents of the first stage again in
 # each later one: a gradient would take two to three times as long. For values alone the scan does not pay.
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))

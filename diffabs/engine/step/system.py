@@ -5,16 +5,20 @@ comparisons are visible (`comparisons`). Fixed steps on this program freeze a mo
 logged or replayed. Without a mode, the derivative of a step places a kink up to one step too early or too late.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.lanes import any_lane
 from diffabs.core.protocols import Memory, Segment
 from diffabs.core.types import PyTree, Scalar
 from diffabs.engine.hybrid import HybridSignals, HybridState, HybridSystem, Margins, Objectives
 from diffabs.engine.step.comparisons import SwitchedProgram
 from diffabs.engine.step.modes import ComparisonAnswers, Mode, ModeBits
+from diffabs.engine.step.sliding_flow import SlidingDynamics, return_to_surfaces, slide
 from diffabs.engine.step.surfaces import SwitchingFunction
 
 Accumulators = dict[str, Memory]
@@ -53,6 +57,7 @@ class Evaluation(NamedTuple):
         signal_rates: Rates of the sample, or of its shown part, or (), as the objectives need them.
         recorded_rates: Rates of the recorded signals, by name.
         margin_rates: Rates of the margins of stop and events; () if they were not evaluated.
+        shares: Shares of the other answer of each comparison along whose surface the run slides; () if it cannot slide.
     """
 
     rates: tuple[PyTree, PyTree]
@@ -64,6 +69,7 @@ class Evaluation(NamedTuple):
     signal_rates: PyTree
     recorded_rates: dict[str, PyTree]
     margin_rates: PyTree
+    shares: tuple[Scalar, ...] = ()
 
 
 class ObservedSystem(NamedTuple):
@@ -100,6 +106,18 @@ class ObservedSystem(NamedTuple):
             return _evaluate_rates(moving, fixed)
         return self.program(lambda dynamics: dynamics[:2], moving, fixed, mode)
 
+    def sliding_rates(self, t: Scalar, z: PyTree, held: PyTree, mode: Mode) -> PyTree:
+        """Return the rates of `rates` along the surfaces of a `mode`."""
+        return slide(partial(self._look_at_rates, held), t, z, mode).dynamics
+
+    def return_to_surfaces(self, t: Scalar, z: PyTree, held: PyTree, mode: Mode) -> PyTree:
+        """Return the flow `z` moved onto the surfaces along which a run in this `mode` slides."""
+        return return_to_surfaces(partial(self._look_at_rates, held), t, z, mode)
+
+    def _look_at_rates(self, held: PyTree, t: Scalar, z: PyTree, mode: Mode) -> tuple[PyTree, ComparisonAnswers]:
+        assert self.program is not None
+        return self.program.look(lambda dynamics: dynamics[:2], (t, *z), (held, self.hybrid, self.objectives), mode)
+
     def list_margins(self, t: Scalar, state: HybridState, accumulators: Accumulators, mode: Mode) -> list[Scalar]:
         """Return the margins of comparisons and then of events at time `t`, `state` and `accumulators` in a `mode`."""
         z, held = split_flow_and_held(state, accumulators)
@@ -117,13 +135,27 @@ class ObservedSystem(NamedTuple):
         z, held = split_flow_and_held(state, accumulators)
         fixed = (held, self.hybrid, self.objectives)
 
-        def look(t: Scalar, z: PyTree) -> tuple[Instant, ComparisonAnswers]:
+        def look(t: Scalar, z: PyTree, mode: Mode) -> tuple[Instant, ComparisonAnswers]:
             if self.program is None:
                 return _evaluate((t, *z), fixed), ComparisonAnswers((), (), [])
             return self.program.look(lambda dynamics: dynamics, (t, *z), fixed, mode)
 
+        def look_aside(t: Scalar, z: PyTree) -> SlidingDynamics:
+            return SlidingDynamics(*look(t, z, mode), tuple(jnp.zeros_like(t) for _ in mode.along))
+
+        if not mode.along:
+            return self._differentiate(look_aside, t, z)
+        return jax.lax.cond(
+            any_lane(mode.slides),
+            lambda: self._differentiate(lambda t, z: slide(look, t, z, mode), t, z),
+            lambda: self._differentiate(look_aside, t, z),
+        )
+
+    def _differentiate(self, look: Callable[[Scalar, PyTree], SlidingDynamics], t: Scalar, z: PyTree) -> Evaluation:
+        """Return what `look` sees at (t, z), with the time derivatives that a step needs."""
+
         def moving_signals(t: Scalar, z: object) -> tuple[PyTree, ComparisonAnswers]:
-            dynamics, answers = look(t, z)
+            dynamics, answers, _ = look(t, z)
             sample = dynamics.signals.sample
             shown = {"sample": sample, "shown": sample.show(), "": ()}[self.signal_rates]
             margins = (
@@ -131,7 +163,7 @@ class ObservedSystem(NamedTuple):
             )
             return (shown, dynamics.signals.recorded, *margins), answers
 
-        dynamics, answers = look(t, z)
+        dynamics, answers, shares = look(t, z)
         surfaces = [SwitchingFunction(*margin_pair) for margin_pair in answers.margins]
         signal_rates, recorded_rates, margin_rates = (), dynamics.signals.recorded, ()
         if self.signal_rates or self.has_margin_rates or self.hybrid.recorders:
@@ -144,7 +176,7 @@ class ObservedSystem(NamedTuple):
                 surfaces = [SwitchingFunction(numbers, value, rate) for (numbers, _), value, rate in each]
         return Evaluation(
             *(dynamics[:2], dynamics.signals, dynamics.margins, answers.words, answers.contradicted, surfaces),
-            *(signal_rates, recorded_rates, margin_rates),
+            *(signal_rates, recorded_rates, margin_rates, shares),
         )
 
 

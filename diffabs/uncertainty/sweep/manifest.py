@@ -152,6 +152,7 @@ read_notes: Callable[[PyTree, str], Any] = table_reader(_read_utf8)
 class _Solver:
     step: float = table_field(range_reader(POSITIVE_SECONDS))
     duration: float = table_field(range_reader(POSITIVE_SECONDS))
+    follow_slides: bool = table_field(read_switch, False)
 
 
 @dataclasses.dataclass(frozen=True)
