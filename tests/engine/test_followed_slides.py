@@ -62,8 +62,8 @@ def test_a_loop_that_slides_has_the_derivative_of_the_exact_solution(name, solve
 def test_values_reverse_mode_and_kernels_are_those_of_forward_mode(solver):
     loop, path, _ = test_slides.SLIDING["textbook anti-windup"]
 
-    def iae(x, engine="xla"):
-        return d.measure(replace(loop, {path: x}), solver, {"iae": IAE()}, engine=engine).metrics["iae"]
+    def iae(x):
+        return d.measure(replace(loop, {path: x}), solver, {"iae": IAE()}).metrics["iae"]
 
     exact, slope = exact_iae("textbook anti-windup", 5.0), jax.jacfwd(iae)(5.0)
     np.testing.assert_allclose(iae(5.0), exact, rtol=1e-7)
