@@ -89,7 +89,8 @@ class Run(NamedTuple):
     def slid(self) -> Bool:
         """True if the run slides along a switching surface, because the flows of both sides push onto it.
 
-        A run with fixed steps for values notices it only if it ends steps on switching surfaces (`FixedStep.kinks`).
+        It is False for a slide that the run follows (`follow_slides` of the solver). A run with fixed steps for values
+        notices a slide only if it ends steps on switching surfaces (`FixedStep.kinks`).
         """
         return False if self.slide is None else self.slide.comparison >= 0
 

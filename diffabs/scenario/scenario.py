@@ -3,7 +3,7 @@
     title, description    one printable line; printable lines
     [plant] [road] [initial] [sensor] [reference] [feedforward] [controller] [actuator] [stop]    a part each: `type`
     [solver]       type (fixed, adaptive), step [s], duration [s], every (trajectories keep every so many steps), rtol
-                   (of adaptive steps), kinks (of fixed ones), seed (of noisy sensors)
+                   (of adaptive steps), kinks (of fixed ones), follow_slides, seed (of noisy sensors)
     [objective]    name = a part; adds to, or changes, those of every report on such a plant
     [design]       requirements on a robust gain, and the ranges of parameters: see `section_design`
     [tune]         free parameters, objective, and the runs it is taken over: see `section_tune`

@@ -362,7 +362,7 @@ def test_a_run_that_slides_along_a_kink_is_a_run():
 @pytest.mark.slow
 @killed_by(
     "engine.step.fixed",
-    "valid &= carry.unrestricted | _is_plausible(carry, attempt) if system.program else True",
+    "valid &= carry.unrestricted | request.mode.slides | _is_plausible(carry, attempt) if system.program else True",
     "pass",
 )
 def test_where_a_step_is_too_long_a_regime_is_not_believed():

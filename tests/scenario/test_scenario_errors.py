@@ -79,7 +79,11 @@ BAD = [
     ("stop.speed=-1", "stop.speed = -1 is outside (0, inf) m/s"),
     ("solver.stp=1", "solver.stp is not a field of adaptive", "did you mean step?"),
     ("solver=rk4", 'solver.type = "rk4" is unknown', "there is fixed, adaptive"),
-    ("solver={type='fixed', rtol=1e-5}", "solver.rtol is not a field of fixed", "step, duration, every, seed, kinks"),
+    (
+        "solver={type='fixed', rtol=1e-5}",
+        "solver.rtol is not a field of fixed",
+        "step, duration, every, follow_slides, seed, kinks",
+    ),
     ("solver={type='adaptive', rtol=0.1}", "solver.rtol = 0.1 is outside [1e-12, 0.01]"),
     ("solver={type='adaptive', kinks=true}", "solver.kinks is not a field of adaptive"),
     ("solver.step=0", "solver.step = 0 is outside (0, inf) s"),

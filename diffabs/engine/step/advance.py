@@ -49,8 +49,8 @@ from diffabs.engine.step.slides import (
     SlideWatch,
     along_of,
     begins_along,
+    decided_answers,
     init_watch,
-    kept_answers,
     watch_landing,
 )
 from diffabs.engine.step.sliding_flow import MAX_SURFACES
@@ -353,7 +353,7 @@ def propose_step(stepping: Stepping, system: ObservedSystem, carry: Carry, strik
     if frozen:
         words = carry.point.words
         beyond = mode_after_changes(
-            words, kept_answers(carry, system.word_count), carry.search.number < system.bit_count
+            words, decided_answers(carry, system.word_count), carry.search.number < system.bit_count
         )
         mode = select(refresh, beyond, mode_in_step(system, words, carry.unrestricted))
         mode = mode._replace(along=along_of(carry))
@@ -399,12 +399,12 @@ def decide_attempt(
         lands = accepted & landing & (number < bit_count)
         # A slide ends with the answer of the side whose share has become 1.
         along = along_of(carry)
-        kept = flips = single_bit(number, system.word_count)
+        decided = flips = single_bit(number, system.word_count)
         for surface, share in zip(along, attempt.shares, strict=True):
             ends, none = surface.number == number, tuple(jnp.zeros_like(word) for word in flips)
             flips = select(ends, select(share > 0.5, surface.answers, none), flips)
-            kept = select(ends, surface.answers, kept)
-        mode = mode_after_changes(flip_answers(attempt.point.words, flips, lands), kept, lands)
+            decided = select(ends, surface.answers, decided)
+        mode = mode_after_changes(flip_answers(attempt.point.words, flips, lands), decided, lands)
     return Decision(valid, accepted, searches, lands, triggered, mode, over)
 
 

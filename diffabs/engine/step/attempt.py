@@ -227,13 +227,13 @@ def mode_in_step(system: ObservedSystem, words: ModeBits, free: Bool) -> Mode:
     return Mode(words, free, tuple(jnp.where(free, all, none) for _ in range(system.word_count)))
 
 
-def mode_after_changes(words: ModeBits, kept: ModeBits, lands: Bool) -> Mode:
+def mode_after_changes(words: ModeBits, decided: ModeBits, lands: Bool) -> Mode:
     """Return the mode in which the dynamics are evaluated after the changes at the end of a step.
 
-    If it `lands` on a switching surface, the bits `kept` keep their answers in `words`: at the zero of a margin,
+    If it `lands` on a switching surface, the bits `decided` keep their answers in `words`: at the zero of a margin,
     rounding could turn them back. All others are evaluated.
     """
-    return Mode(words, ~lands, tuple(~jnp.where(lands, bits, jnp.uint32(0)) for bits in kept))
+    return Mode(words, ~lands, tuple(~jnp.where(lands, bits, jnp.uint32(0)) for bits in decided))
 
 
 def flip_answers(words: ModeBits, bits: ModeBits, lands: Bool) -> ModeBits:

@@ -151,8 +151,8 @@ class ReplayStepping:
         entry, k = self.entry, carry.k
         h = jnp.where(entry.refresh | ~entry.accepted, 0.0, entry.length - carry.control.delay)
         end = jnp.where(entry.refresh, carry.point.t, entry.t)
-        own, next = (entry.words, entry.along), (entry.next_words, entry.next_along)
-        words, along = select(entry.refresh, next, own)
+        step, next = (entry.words, entry.along), (entry.next_words, entry.next_along)
+        words, along = select(entry.refresh, next, step)
         mode = mode_in_step(system, words, entry.unrestricted)._replace(along=along)
         strikes = entry.k != k
 

@@ -52,7 +52,7 @@ class Followed(NamedTuple):
         along: Surfaces along which it slides.
         words: Mode of the last step that has landed.
         answers: Bits in which it differs from that of the landing before.
-        kept: Bits whose answers the last landing has decided: at the zero of a margin rounding could turn them back.
+        decided: Bits whose answers the last landing has decided: at the zero of a margin rounding could turn them back.
         last: Number of the comparison on whose surface the run has landed last; -1 after a calm step.
         ended: That number if the landing has ended a slide along the surface; else -1.
     """
@@ -60,7 +60,7 @@ class Followed(NamedTuple):
     along: tuple[SlidingSurface, ...]
     words: ModeBits
     answers: ModeBits
-    kept: ModeBits
+    decided: ModeBits
     last: Array
     ended: Array
 
@@ -140,16 +140,16 @@ def _follow(followed: Followed, landing: Landing, returned: Bool) -> tuple[Follo
     answers = tuple(a ^ b for a, b in zip(landing.words, followed.words, strict=True))
     same = jnp.all(jnp.stack([a == b for a, b in zip(answers, followed.answers, strict=True)]))
     leaves = reduce(jnp.logical_or, [landed & (surface.number == number) for surface in followed.along])
-    waits, kept = returned & same & ~leaves, single_bit(number, len(answers))
+    waits, decided = returned & same & ~leaves, single_bit(number, len(answers))
     none = SlidingSurface(jnp.full_like(number, -1), tuple(jnp.zeros_like(word) for word in answers))
     for surface in followed.along:
         ends, begins = landed & (surface.number == number), waits & ~surface.exists
-        kept = select(ends, surface.answers, kept)
+        decided = select(ends, surface.answers, decided)
         along.append(select(begins, SlidingSurface(number, answers), select(ends | landing.reset, none, surface)))
         waits &= ~begins
     full = reduce(jnp.logical_and, [surface.exists for surface in followed.along])
-    old = followed.words, followed.answers, followed.kept
-    modes = select(landed, (landing.words, answers, kept), old)
+    old = followed.words, followed.answers, followed.decided
+    modes = select(landed, (landing.words, answers, decided), old)
     last = jnp.where(landed, number, jnp.where(landing.calm, -1, followed.last)).astype(number.dtype)
     ended = jnp.where(landed, jnp.where(leaves, number, -1), followed.ended).astype(number.dtype)
     return Followed(tuple(along), *modes, last, ended), returned & ~leaves & full
@@ -176,10 +176,10 @@ def along_of(carry: Any) -> tuple[SlidingSurface, ...]:
     return _surfaces(carry.slides)
 
 
-def kept_answers(carry: Any, words: int) -> ModeBits:
+def decided_answers(carry: Any, words: int) -> ModeBits:
     """Return the bits whose answers the last landing of a run has decided, in this number of words."""
     if along_of(carry):
-        return carry.slides.followed.kept
+        return carry.slides.followed.decided
     return single_bit(carry.search.number, words)
 
 

@@ -4,7 +4,7 @@
     several        dz/dt = f + sum_i s_i (g_i - f)     each answer acts by itself, as switched forces do
 
 The shares s keep the margins of these comparisons at zero. A slide ends where its share reaches 0 or 1, so s (1 - s) is
-its margin: an event like any other. Signals are mixed by the same shares: the control is the equivalent control.
+its margin: an event like any other. Signals are mixed by the same shares: objectives see the equivalent control.
 
 Source: Filippov, Differential Equations with Discontinuous Righthand Sides, section 4; for several surfaces the rule
 of the equivalent control, Utkin, Sliding Modes in Control and Optimization, chapter 2.

@@ -148,19 +148,19 @@ def _read_utf8(text: PyTree, path: str) -> str:
 read_notes: Callable[[PyTree, str], Any] = table_reader(_read_utf8)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Solver:
     step: float = table_field(range_reader(POSITIVE_SECONDS))
     duration: float = table_field(range_reader(POSITIVE_SECONDS))
     follow_slides: bool = table_field(read_switch, False)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Fixed(_Solver):
     kinks: bool | None = table_field(read_switch, None)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class _Adaptive(_Solver):
     rtol: float = table_field(range_reader(FINITE_SPEC))
 
