@@ -187,8 +187,8 @@ FIXED = d.FixedStep(1e-2, 3.0)
 
 @killed_by(
     "engine.step.replay",
-    "landing & old.search.at_once & (old.search.fall == 0)",
-    "landing & False",
+    "(old.search.fall == 0) | is_return(old, lands)",
+    "is_return(old, lands)",
     case="adaptive",
 )
 @killed_by(
