@@ -10,11 +10,12 @@ from diffabs.host.values import ScenarioError, format_given
 MOST_LEVELS = 50  # of nested tables and lists; a scenario has fewer than 5
 MAX_INTEGER = 2**63  # bound of whole numbers: TOML has 64 bits
 MAX_MESSAGE_LENGTH = 200  # characters
-# What separates the keys of a text: each match is a string, a comment, a dot, or the end of a key. Possessive
-# quantifiers, and an unclosed string that ends with the text, keep the search linear.
+# What separates the keys of a text: each match is a string, a comment, a dot, or the end of a key. The search is
+# linear: the parts of a string begin with different signs, and an unclosed one ends with the text. No quantifier is
+# possessive: Python before 3.11.5 matches a possessive group wrongly.
 KEY_TOKENS = re.compile(
-    r'''"""(?:[^"\\]|\\.?|"(?!""))*+(?:"{3,5}|\Z)|"(?:[^"\\\n]|\\.?)*+"?'''
-    r"""|'''(?:[^']|'(?!''))*+(?:'{3,5}|\Z)|'[^'\n]*+'?|#[^\n]*+|(?P<dot>\.)|(?P<end>[=,\[\]{}\n])""",
+    r'''"""[^"\\]*(?:(?:\\.|"(?!""))[^"\\]*)*(?:"{3,5}|\\?\Z)|"[^"\\\n]*(?:\\.[^"\\\n]*)*[\\"]?'''
+    r"""|'''[^']*(?:'(?!'')[^']*)*(?:'{3,5}|\Z)|'[^'\n]*'?|#[^\n]*|(?P<dot>\.)|(?P<end>[=,\[\]{}\n])""",
     re.DOTALL,
 )
 
