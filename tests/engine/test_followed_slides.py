@@ -34,7 +34,6 @@ EXACT = ("textbook anti-windup", "dry friction", "bang-bang law")
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("name", cases(dict.fromkeys(EXACT), "textbook anti-windup", "bang-bang law"))
-@killed_by("engine.step.advance", "select(share > 0.5, surface.answers, none)", "none")
 @killed_by(
     "engine.step.slides",
     "select(begins, SlidingSurface(number, answers)",
