@@ -51,7 +51,6 @@ from diffabs.engine.step.slides import (
     begins_along,
     decided_answers,
     init_watch,
-    lose_unrestricted,
     watch_landing,
 )
 from diffabs.engine.step.sliding_flow import MAX_SURFACES
@@ -269,8 +268,6 @@ def advance(
     elif stepping.smooth:
         after = after._replace(status=_next_status(system, carry, attempt, decision, carry.status))
     after = stepping.plan_next(system, carry, attempt, decision, after)
-    if along_of(after):
-        after = after._replace(slides=lose_unrestricted(after.slides, after.unrestricted, attempt.point.t))
     status = jnp.where(active, after.status, carry.status).astype(carry.status.dtype)
     status, unrestricted = keep_decision((status, after.unrestricted))
     after = after._replace(status=status, unrestricted=unrestricted)

@@ -171,14 +171,6 @@ def begin_slide(slide: Slide, begins: Bool, number: Int, t: Scalar) -> Slide:
     return Slide(jnp.where(first, number, slide.comparison), jnp.where(first, jax.lax.stop_gradient(t), slide.t))
 
 
-def lose_unrestricted(watch: SlideWatch, unrestricted: Bool, t: Scalar) -> SlideWatch:
-    """Return the watch; a slide is lost where the steps of its run keep to no mode, and so to no surface."""
-    lost = watch.lost
-    for surface in _surfaces(watch):
-        lost = begin_slide(lost, unrestricted & surface.exists, surface.number, t)
-    return watch._replace(lost=lost)
-
-
 def along_of(carry: Any) -> tuple[SlidingSurface, ...]:
     """Return the surfaces along which a run slides, as `Mode.along`."""
     return _surfaces(carry.slides)
