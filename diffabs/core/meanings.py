@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import inspect
 import itertools
-import textwrap
+import sys
 from typing import TypeVar
 
 ClassT = TypeVar("ClassT", bound=type)
@@ -17,13 +17,40 @@ def field_meanings(cls: type) -> dict[str, str]:
     meanings: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         try:
-            (tree, *_) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        except (OSError, TypeError, SyntaxError):
+            lines, _ = inspect.findsource(sys.modules[base.__module__])
+            meanings |= _meanings_by_class("".join(lines)).get(base.__qualname__, {})
+        except (KeyError, OSError, TypeError, SyntaxError):
             continue
-        for field, text in itertools.pairwise(tree.body if isinstance(tree, ast.ClassDef) else ()):
-            match field, text:
-                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(meaning))):
-                    meanings[name] = " ".join(meaning.split())
+    return meanings
+
+
+@functools.cache
+def _meanings_by_class(source: str) -> dict[str, dict[str, str]]:
+    """Return the strings below the fields of all classes of a module, by qualified name of the class and by field."""
+    # Each module is parsed once; `inspect.getsource` of a class would parse and tokenise it again for each class.
+    classes: dict[str, dict[str, str]] = {}
+
+    def visit(statements: list[ast.stmt], prefix: str) -> None:
+        for statement in statements:
+            match statement:
+                case ast.ClassDef(name=name, body=body):
+                    classes[prefix + name] = _meanings_in(body)
+                    visit(body, f"{prefix}{name}.")
+                case ast.FunctionDef(name=name, body=body):
+                    visit(body, f"{prefix}{name}.<locals>.")
+                case ast.If() | ast.Try():
+                    visit([*statement.body, *statement.orelse], prefix)
+
+    visit(ast.parse(source).body, "")
+    return classes
+
+
+def _meanings_in(body: list[ast.stmt]) -> dict[str, str]:
+    meanings = {}
+    for field, text in itertools.pairwise(body):
+        match field, text:
+            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(str(meaning))):
+                meanings[name] = " ".join(meaning.split())
     return meanings
 
 

@@ -4,12 +4,15 @@ import collections
 import dataclasses
 import inspect
 import re
+import sys
+import types
 
 import pytest
 from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, linear
+from diffabs.core import meanings as meanings_module
 from diffabs.core.meanings import field_meanings
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Scalar
@@ -112,15 +115,39 @@ def test_a_field_of_a_base_keeps_its_meaning():
     assert field_meanings(Slower) == {"time_constant": "Time constant of the control."}
 
 
-@killed_by("core.meanings", "except (OSError, TypeError, SyntaxError):", "except (TypeError, SyntaxError):")
-def test_a_class_without_source_has_no_meanings():
-    scope = {"__name__": "__main__", "pytree": pytree, "param": param, "Scalar": Scalar}
+@killed_by("core.meanings", "except (KeyError, OSError, TypeError, SyntaxError):", "except (TypeError, SyntaxError):")
+@pytest.mark.parametrize("module", [{}, {"__file__": None}, {"__file__": "/gone.py"}], ids=["none", "typed", "gone"])
+def test_a_class_without_source_has_no_meanings(module, monkeypatch):
+    if module:
+        monkeypatch.setitem(sys.modules, "typed_in", types.ModuleType("typed_in"))
+        vars(sys.modules["typed_in"]).update(module)
+    scope = {"__name__": "typed_in", "pytree": pytree, "param": param, "Scalar": Scalar}
     exec('@pytree\nclass Typed:\n    """Typed in."""\n    x: Scalar = param(default=1.0, unit="m")\n', scope)
     assert field_meanings(scope["Typed"]) == {}
     assert inspect.getdoc(scope["Typed"]) == "Typed in.\n\nAttributes:\n    x: In (-inf, inf) m."
 
 
+@killed_by("core.meanings", "@functools.cache\ndef _meanings_by_class", "def _meanings_by_class")
+def test_a_module_is_parsed_once_for_all_its_classes():
+    class First:
+        x: int
+        """Read first."""
+
+        class Inner:
+            y: int
+            """Read inside."""
+
+    class Second:
+        x: int
+        """Read second."""
+
+    meanings_module._meanings_by_class.cache_clear()
+    meanings = [field_meanings(cls) for cls in (First, First.Inner, Second)]
+    assert meanings == [{"x": "Read first."}, {"y": "Read inside."}, {"x": "Read second."}]
+    assert meanings_module._meanings_by_class.cache_info().misses == 1
+
+
 @pytest.mark.parametrize("cls", [controllers.PID, d.FixedStep])
 def test_a_part_is_made_without_reading_its_source(cls, monkeypatch):
-    monkeypatch.setattr(inspect, "getsource", lambda _: pytest.fail("the source was read"))
+    monkeypatch.setattr(inspect, "findsource", lambda _: pytest.fail("the source was read"))
     assert dataclasses.replace(cls()) is not None
