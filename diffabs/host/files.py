@@ -164,17 +164,18 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     Linux exchanges the old and the new folder in one step. Other systems, and some network file systems, take two
     steps. A process killed between them leaves no `target`, and the old content in `.NAME.*/old` beside it. The folder
     behind a symbolic link is replaced, and the link stays. A killed process may leave a hidden folder `.NAME.*` in any
-    case; remove it when no process writes.
+    case; remove it when no process writes. Missing parents of `target` are made at the end, and not after an error.
     """
     target = pathlib.Path(os.path.realpath(target))
     if target.exists() and not target.is_dir():
         raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(target))
-    target.parent.mkdir(parents=True, exist_ok=True)
-    room = pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    place = next(parent for parent in target.parents if parent.exists())
+    room = pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=place))
     with name_in_disk_errors(target, room), temporary_path(room):
         new, old = room / "new", room / "old"
         new.mkdir()
         yield new
+        target.parent.mkdir(parents=True, exist_ok=True)
         if target.exists():
             if _exchange(new, target):
                 return

@@ -174,6 +174,7 @@ def test_reproduce_keeps_the_old_result_when_interrupted(papers, tmp_path):
     result = run("reproduce", "slip-lmi", "--out", tmp_path, status=130)
     assert result.stderr.splitlines()[-1] == "interrupted"
     assert (tmp_path / "slip-lmi" / "summary.json").read_text() == "old"
+    run("reproduce", "slip-lmi", "--out", tmp_path / "new", status=130)
     assert left_in(tmp_path) == {"slip-lmi"}
 
 

@@ -60,6 +60,18 @@ def test_a_folder_without_an_exchange_is_replaced(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
+@killed_by("host.files", "if parent.exists()", "if not parent.mkdir(parents=True, exist_ok=True)")
+@killed_by("host.files", "        target.parent.mkdir(parents=True, exist_ok=True)\n", "")
+def test_parents_of_a_folder_are_made_at_the_end(tmp_path):
+    with pytest.raises(KeyboardInterrupt), files.new_folder(tmp_path / "out" / "paper"):
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+    with files.new_folder(tmp_path / "out" / "paper") as new:
+        (new / "content").touch()
+    assert [path.name for path in (tmp_path / "out" / "paper").iterdir()] == ["content"]
+    assert [path.name for path in tmp_path.rglob("*")] == ["out", "paper", "content"]
+
+
 @killed_by("host.files", "target.exists() and not target.is_dir()", "False")
 @killed_by("host.files", "target.exists() and not target.is_file()", "False")
 def test_what_is_no_file_or_folder_is_not_replaced(tmp_path):
