@@ -3,7 +3,7 @@
 import functools
 import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -61,11 +61,7 @@ def prove(
         sides = _read_sides(over, setup)
         box = {side.path: side.ends for side in sides}
         if plot:
-            _wide_sides(sides)  # refuses other boxes before anything is proved
-        if "slip" not in setup.loop.plant.shows._fields and not claim:
-            raise ScenarioError(
-                f"--claim is needed: the plant has no slip; it has {', '.join(setup.loop.plant.shows._fields)}"
-            )
+            _check_drawable(box)
         with targets.new_target_file(plot, "--plot") as picture:
             with targets.new_target_file(out, "--out") as file:
                 try:
@@ -104,18 +100,16 @@ def _read_sides(options: Sequence[str], scenario: Scenario) -> list[BoxSide]:
     return read_box(table, "--over", scenario.loop)
 
 
-def _wide_sides(sides: Sequence[BoxSide]) -> list[BoxSide]:
-    """Return the parameters with more than one value. Raises ScenarioError unless there are one or two."""
+def _check_drawable(box: Mapping[str, tuple[float, float]]) -> None:
+    """Refuse a box with no map before anything is proved."""
     from diffabs.robust.reach.extremes import is_wide
 
-    wide = [side for side in sides if is_wide(side.ends)]
-    if len(wide) not in (1, 2):
-        raise ScenarioError(f"--plot draws one or two parameters; {len(wide)} of --over have more than one value")
-    return wide
+    if (count := sum(map(is_wide, box.values()))) not in (1, 2):
+        raise ScenarioError(f"--plot draws one or two parameters; {count} of --over have more than one value")
 
 
 def _draw(proof: "Proof", scenario: Scenario, sides: Sequence[BoxSide], picture: pathlib.Path) -> None:
     from diffabs.output.plot import proofs
 
-    shown = proofs.map_proof(proof, _wide_sides(sides), scenario.title or scenario.name)
+    shown = proofs.map_proof(proof, sides, scenario.title or scenario.name)
     console.run_with_progress(lambda: proofs.draw_proof(shown).savefig(picture), "drawing")

@@ -20,6 +20,7 @@ import numpy as np
 from diffabs.core.types import JsonObject
 from diffabs.engine.solvers import Solver
 from diffabs.host import documents, files
+from diffabs.host.values import ScenarioError
 from diffabs.loop.closed_loop import Loop
 from diffabs.parts.objectives import default_objectives
 from diffabs.robust.design.verify import MAX_SECONDS, ClaimVerdict, verify_file
@@ -167,7 +168,8 @@ def prove_box(
         progress: Called with a line about how far the proof is.
 
     Raises:
-        ValueError: A number is out of its range, a claim is about no quantity of the loop, or a signal does not exist.
+        ValueError: A number is out of its range, a claim is about no quantity of the loop, a signal does not exist, or
+            there is neither claim nor signal.
         NoRule: A part, an operation or a parameter of the loop has no sound rule.
         NoCompiler: No C++ compiler of this machine works.
 
@@ -193,6 +195,8 @@ def prove_box(
     derive_equations(loop, over)  # may refuse the loop, before anything is simulated
     if signals is None:
         signals = [name for name in loop.plant.shows._fields if name == "slip"]
+    if not (claims or signals):
+        raise ScenarioError(f"a claim is needed: the plant has no slip; it has {', '.join(loop.plant.shows._fields)}")
     extremes = find_extreme_runs(loop, solver, over)
     cover = cover_box(
         loop, over, claims, signals=signals, horizon=solver.duration, budget=budget,

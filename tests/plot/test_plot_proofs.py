@@ -1,11 +1,16 @@
 """The map of a proof: each cell where it is, in the colour of its bound."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from matplotlib.collections import PatchCollection
 from mutants import killed_by
 
-from diffabs.output.plot.proofs import ProofMap, draw_proof
+from diffabs.output.plot.proofs import ProofMap, draw_proof, map_proof
+from diffabs.robust.reach.extremes import ExtremeRuns
+from diffabs.scenario.parameter_paths import BoxSide
 
 CELLS = np.array([[[0, 1], [0, 1]], [[1, 2], [0, 1]], [[0, 2], [1, 1.5]]], float)
 LEFT, REFUTING = np.array([[[0, 1], [1.5, 2]]], float), np.array([[1, 2], [1.5, 2]], float)
@@ -71,3 +76,20 @@ def test_a_proof_of_nothing_is_drawn(parameters: int) -> None:
     figure = draw_proof(none)
     figure.draw_without_rendering()
     assert [text.get_text() for text in figure.legends[0].get_texts()][-1:] == ["not proved"]
+
+
+@killed_by("output.plot.proofs", "if is_wide(side.ends)]", "]")
+@killed_by("output.plot.proofs", "if len(sides) not in (1, 2):", "if False:")
+def test_a_map_has_the_parameters_that_vary() -> None:
+    ends = {"plant.mass": (5.0, 6.0), "initial.speed": (3.0, 3.0), "reference.slip": (0.1, 0.2)}
+    sides = [BoxSide(path, pair, f"{path} [SI]", 1.0) for path, pair in ends.items()]
+    empty = np.zeros((0, 3, 2))
+    proof: Any = SimpleNamespace(
+        over=ends, claims=(), verdict="undecided", extremes=ExtremeRuns({}, {}), unit_of=lambda quantity: "1",
+        cover=SimpleNamespace(rows=None, cells=empty, undecided=empty, refuting=None),
+    )  # fmt: skip
+    shown = map_proof(proof, sides, "T")
+    assert shown.labels == ["plant.mass [SI]", "reference.slip [SI]"]
+    assert shown.box.tolist() == [[5.0, 6.0], [0.1, 0.2]]
+    with pytest.raises(ValueError, match="one or two parameters; 0 have more than one value"):
+        map_proof(proof, sides[1:2], "T")

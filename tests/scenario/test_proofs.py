@@ -106,6 +106,14 @@ def test_a_noisy_loop_is_refused_before_it_runs(monkeypatch: pytest.MonkeyPatch)
         d.prove_box(scenario.loop, scenario.solver, OVER)
 
 
+@killed_by("scenario.proofs", "if not (claims or signals):", "if False:")
+def test_a_plant_without_slip_needs_a_claim(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("diffabs.scenario.proofs.find_extreme_runs", lambda *_: pytest.fail("simulated"))
+    scenario = load("arm-hanging")
+    with pytest.raises(ValueError, match="a claim is needed: the plant has no slip; it has theta"):
+        d.prove_box(scenario.loop, scenario.solver, {"plant.body_mass": (30.0, 31.0)})
+
+
 def invent_proof(**values: Any) -> Proof:
     """Return a proof whose cover has these values, over masses of 5 to 6 kg."""
     scenario, empty = load("slip-lmi", integrated=False), np.zeros((0, 1, 2))

@@ -8,6 +8,7 @@ from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 
 from diffabs.output.plot.style import COLOURS, GREY, Axes, Figure, Patch, label_axes, sheet
+from diffabs.robust.reach.extremes import is_wide
 
 if TYPE_CHECKING:
     from diffabs.scenario.parameter_paths import BoxSide
@@ -48,7 +49,14 @@ class ProofMap(NamedTuple):
 
 
 def map_proof(proof: "Proof", sides: Sequence["BoxSide"], title: str) -> ProofMap:
-    """Return the map of the first claim's quantity, else of the greatest slip, over one or two `sides` of the box."""
+    """Return the map of the first claim's quantity, else of the greatest slip, over the parameters that vary.
+
+    Raises:
+        ValueError: Of the `sides` of the box not one or two have more than one value.
+    """
+    sides = [side for side in sides if is_wide(side.ends)]
+    if len(sides) not in (1, 2):
+        raise ValueError(f"a map has one or two parameters; {len(sides)} have more than one value")
     paths = list(proof.over)
     axes, scales = [paths.index(side.path) for side in sides], np.array([side.scale for side in sides])
     claims, cover = proof.claims, proof.cover
