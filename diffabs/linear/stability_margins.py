@@ -1,12 +1,12 @@
 """Gain, phase and delay margins of a loop, its modulus margin, and the peaks of its sensitivities.
 
-    L  the open loop, of one input and one output, with feedback u = -L v;   S = 1/(1 + L),   T = L/(1 + L)
+    L  the open loop, from one input to one output, closed by negative feedback;   S = 1/(1 + L),   T = L/(1 + L)
 
 The poles decide whether the closed loop is stable. With a pure delay, the poles that cross the stability boundary are
 counted while the delay grows from zero. They cross only where |L| = 1 (Cooke and van den Driessche, On zeroes of some
 transcendental equations, 1986). Crossings are bracketed on a grid, which is refined until neighbours are close, and
-bisected to rounding. The grid separates all frequencies with |L| = 1. They are eigenvalues of a Hamiltonian matrix
-(Boyd, Balakrishnan and Kabamba, A bisection method for computing the H-infinity norm, 1989).
+bisected to rounding. The frequencies with |L| = 1 are eigenvalues of a Hamiltonian matrix, and the grid has a point
+between each two of them (Boyd, Balakrishnan and Kabamba, A bisection method for computing the H-infinity norm, 1989).
 
 In continuous time and without a delay, the direct path D is the limit of L at infinite frequency. It counts as a value
 of L. A delay turns it through all angles. With |D| > 1 every delay makes infinitely many unstable poles. With |D| = 1
@@ -27,21 +27,23 @@ from diffabs.linear.delay_steps import LEAST_DISTANCE, REACHING, DelayedLoop
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.transfer import Transfer, check_transfer
 
-GRID_DECADES, PER_DECADE = 4, 60  # beyond the slowest and the fastest pole; points of the grid before it is refined
-UNIT_TOLERANCE = 1e-12  # of |L| = 1, where |L| reaches 1 and does not cross it
+# Decades of the grid beyond the slowest and the fastest pole, and its points per decade before it is refined.
+GRID_DECADES, PER_DECADE = 4, 60
+# Distance of |L| from 1 that counts as a touch of the unit circle, and distance on the grid of a place to examine.
+UNIT_TOLERANCE, NEAR_UNIT = 1e-12, 0.1
 NEIGHBOUR_DISTANCE, MAX_GRID_REFINEMENTS = 0.05, 14  # relative distance of neighbours; how often the grid is refined
 # |L| below which the turns of a delay are not resolved; angle by which a delay turns L between points [rad].
 SMALL_LOOP_GAIN, DELAY_TURN_ANGLE = 1e-3, 0.2
 MAX_GRID_FREQUENCIES = 200_000  # points of a grid
 MIN_FREQUENCY, MAX_RANGE_STEPS = 1e-60, 4  # lowest frequency of a grid [rad/s]; steps to crossovers far from the poles
 ROOT_BISECTIONS, GOLDEN = 70, (math.sqrt(5) - 1) / 2
-REAL_TOLERANCE = 1e-9  # relative: |L(0)| and L at half the sampling rate are real but for rounding
+REAL_TOLERANCE = 1e-9  # relative: L(0) and L at half the sampling rate are real but for rounding
 # Longest delay to try with a sampled loop: in periods, and in multiples of the margin without a new sampling. The most
 # steps of the delay, each as long as is safe, before the search gives up.
 MAX_DELAY_PERIODS, MAX_DELAY_MULTIPLE = 1000, 4.0
 MAX_DELAY_STEPS = 3000
-WATCHED_DISTANCE = 10 * LEAST_DISTANCE  # distance of L from -1 below which the poles are looked at after each step
-MAX_SHIFTS = 30  # periods of delay that become states; the poles of more are counted by crossings
+WATCHED_DISTANCE = 10 * LEAST_DISTANCE  # distance of L from -1 below which the poles are computed after each step
+MAX_SHIFTS = 30  # periods of delay that become states; with more, poles are counted by their crossings
 
 MARGIN_UNITS = {
     "gain_up": "1",
@@ -64,7 +66,8 @@ class Margins(NamedTuple):
         stable: Whether the closed loop is stable.
         gain: Factors (low, high), low < 1 < high: the loop is stable for its gain times any factor between them. They
             are 0 and infinity without a limit.
-        gain_at: Frequencies (low, high) at which the factors bring L to -1 [rad/s]; NaN without a limit.
+        gain_at: Frequencies (low, high) at which the factors bring L to -1, the phase crossovers [rad/s]; NaN without a
+            limit.
         phase: Phase margin [rad]: the smallest angle, lag or lead, that reaches -1; infinity without a crossover.
         phase_at: Its frequency [rad/s].
         delay: Delay margin [s], the smallest added delay that makes the loop unstable; 0 if every delay does. Infinity
@@ -100,28 +103,31 @@ class Margins(NamedTuple):
         return values | {name: getattr(self, name) for name in MARGIN_UNITS if name not in values}
 
     def record(self) -> JsonObject:
-        """Return `stable` and the `numbers` as JSON values. Infinity, which says that there is no limit, is a text."""
-        numbers = {name: "inf" if value == math.inf else float(value) for name, value in self.numbers().items()}
-        return {"stable": self.stable, **numbers}
+        """Return `stable` and the `numbers` as JSON values; infinity (no limit) is the text "inf", and NaN is None."""
+        return {"stable": self.stable, **{name: _json_number(value) for name, value in self.numbers().items()}}
+
+
+def _json_number(value: float) -> float | str | None:
+    return "inf" if value == math.inf else None if math.isnan(value) else float(value)
 
 
 class Crossovers(NamedTuple):
-    """Frequencies at which |L| = 1, and frequencies at which L is real and negative.
+    """The gain crossovers, at which |L| = 1, and the phase crossovers, at which L is real and negative.
 
     Attributes:
-        gain_at: Frequencies with |L| = 1 [rad/s]; infinity is one of them if |D| = 1 in continuous time.
+        unit_at: Frequencies with |L| = 1 [rad/s]; infinity is one of them if |D| = 1 in continuous time.
         falls: Whether |L| falls there, with growing frequency.
         phases: Angle of -L at these frequencies, the phase of L plus pi, in (-pi, pi] [rad].
-        phase_at: Frequencies at which L is real and negative [rad/s]. Infinity is one of them in continuous time if
+        negative_at: Frequencies at which L is real and negative [rad/s]. Infinity is one of them in continuous time if
             D < 0, or if there is a delay and D is not zero.
-        factors: 1/|L| at the frequencies `phase_at`.
+        factors: 1/|L| at the frequencies `negative_at`.
     """
 
-    gain_at: Float[np.ndarray, " gains"]
-    falls: Bool[np.ndarray, " gains"]
-    phases: Float[np.ndarray, " gains"]
-    phase_at: Float[np.ndarray, " phases"]
-    factors: Float[np.ndarray, " phases"]
+    unit_at: Float[np.ndarray, " units"]
+    falls: Bool[np.ndarray, " units"]
+    phases: Float[np.ndarray, " units"]
+    negative_at: Float[np.ndarray, " negatives"]
+    factors: Float[np.ndarray, " negatives"]
 
 
 @default_flags()
@@ -151,7 +157,7 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
         `linear.linearize`: Its linear model.
 
     Notes:
-        With the open loop L, feedback u = -L v, S = 1/(1 + L) and T = L/(1 + L)
+        With the open loop L, negative feedback, S = 1/(1 + L) and T = L/(1 + L)
 
             gain      the factors k nearest to 1 with k L(jw) = -1
             phase     the least |angle| to -1 over all w with |L(jw)| = 1
@@ -182,18 +188,18 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
     loop = check_transfer(loop) if isinstance(loop, Transfer) else loop
     system = check_transfer(loop.transfer()) if isinstance(loop, OpenLoop) else loop
     if np.shape(system.D) != (1, 1):
-        raise ValueError(f"margins are of one input and one output; the system has {np.shape(system.D)[::-1]}")
+        outputs, inputs = np.shape(system.D)
+        raise ValueError(f"margins are of one input and one output; the system has {inputs} and {outputs}")
     w = frequency_grid(system)
     crossovers = find_crossovers(system, w)
-    crossover = float(crossovers.gain_at.max()) if len(crossovers.gain_at) else math.nan
+    crossover = float(crossovers.unit_at.max()) if len(crossovers.unit_at) else math.nan
     if not is_stable(system):
         none = (math.nan, math.nan)
         return Margins(False, none, none, *none, math.nan, *none, *none, crossover)
-    if not len(crossovers.gain_at):
-        crossovers = _touch_unit_circle(system, w, crossovers)
-        crossover = float(crossovers.gain_at.max()) if len(crossovers.gain_at) else math.nan
+    crossovers = _add_touches(system, w, crossovers)
+    crossover = float(crossovers.unit_at.max()) if len(crossovers.unit_at) else math.nan
     i = int(np.argmin(np.abs(crossovers.phases))) if len(crossovers.phases) else None
-    phase, phase_at = (math.inf, math.nan) if i is None else (abs(crossovers.phases[i]), crossovers.gain_at[i])
+    phase, phase_at = (math.inf, math.nan) if i is None else (abs(crossovers.phases[i]), crossovers.unit_at[i])
     gain, gain_at = _gain_margins(crossovers)
     ms, mt = _sensitivities(system, w)
     angle = (float(phase), float(phase_at))
@@ -203,37 +209,51 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
 def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers:
     """Return the frequencies [rad/s] at which |L| = 1, and at which L is real and negative, from a grid `w`."""
     w = frequency_grid(system) if w is None else w
-    gain_at, falls = _roots(lambda w: np.log(np.abs(_response(system, w))), w)
-    phases = np.angle(-_response(system, gain_at))
-    phase_at, _ = _roots(lambda w: _response(system, w).imag, w)
+    unit_at, falls = _roots(lambda w: np.log(np.abs(_response(system, w))), w)
+    phases = np.angle(-_response(system, unit_at))
+    negative_at, _ = _roots(lambda w: _response(system, w).imag, w)
     ends = [0.0, *([math.pi / system.period] if system.period else [])]
-    phase_at = np.union1d(phase_at, [end for end in ends if _is_real(system, end)])
-    values = _response(system, phase_at).real
+    negative_at = np.union1d(negative_at, [end for end in ends if _is_real(system, end)])
+    values = _response(system, negative_at).real
     real = (values < 0) & np.isfinite(values)
-    real &= np.abs(_response(system, phase_at).imag) <= 1e-6 * np.abs(values)  # a sign change at a pole is no crossing
-    phase_at, factors = phase_at[real], -1 / values[real]
+    # A sign change at a pole is no crossing.
+    real &= np.abs(_response(system, negative_at).imag) <= 1e-6 * np.abs(values)
+    negative_at, factors = negative_at[real], -1 / values[real]
     if system.period is None:
         far = _limit_at_infinity(system)
         if abs(far) == 1:
-            gain_at, phases = np.append(gain_at, math.inf), np.append(phases, np.angle(-far))
+            unit_at, phases = np.append(unit_at, math.inf), np.append(phases, np.angle(-far))
             falls = np.append(falls, True)
         if far < 0:
-            phase_at, factors = np.append(phase_at, math.inf), np.append(factors, -1 / far)
-    return Crossovers(gain_at, falls, phases, phase_at, factors)
+            negative_at, factors = np.append(negative_at, math.inf), np.append(factors, -1 / far)
+    return Crossovers(unit_at, falls, phases, negative_at, factors)
 
 
-def _touch_unit_circle(system: Transfer, w: np.ndarray, crossovers: Crossovers) -> Crossovers:
-    """Return the crossovers with the highest frequency at which |L| reaches 1 from below, if it does."""
+def _add_touches(system: Transfer, w: np.ndarray, crossovers: Crossovers) -> Crossovers:
+    """Return the crossovers with the frequencies at which |L| reaches 1 and does not cross it."""
+
+    def distance(w: np.ndarray) -> np.ndarray:
+        gap = np.abs(np.log(np.abs(_response(system, w))))
+        return np.where(gap <= UNIT_TOLERANCE, 0.0, gap)
+
     with np.errstate(all="ignore"):
-        values = np.abs(_response(system, w))
-    highest = np.flatnonzero(values >= np.nanmax(values) * (1 - UNIT_TOLERANCE))[-1]
-    size, at = _peak(lambda w: np.abs(_response(system, w)), w[max(highest - 1, 0) :])
-    if values[highest] >= size * (1 - UNIT_TOLERANCE):
-        size, at = float(values[highest]), float(w[highest])
-    if abs(size - 1) > UNIT_TOLERANCE:
-        return crossovers
-    gain_at = np.array([at])
-    return crossovers._replace(gain_at=gain_at, falls=np.array([True]), phases=np.angle(-_response(system, gain_at)))
+        values, signs = distance(w), np.sign(np.log(np.abs(_response(system, w))))
+    # The end of the grid is the end of the axis only if the loop is sampled. A plateau counts where it ends.
+    after = np.append(values[1:], math.inf if system.period else -math.inf)
+    before = np.insert(values[:-1], 0, -math.inf)
+    lowest = np.flatnonzero((values <= before) & (values < after) & (values < NEAR_UNIT))
+    touches = []
+    for i in lowest:
+        around = slice(max(i - 1, 0), i + 2)
+        gap, at = (0.0, w[i]) if values[i] == 0 else _peak(lambda w: -distance(w), w[around])
+        if gap == 0 and len(set(signs[around] > 0)) == 1:
+            touches.append(at)
+    unit_at = np.array(touches)
+    return crossovers._replace(
+        unit_at=np.append(crossovers.unit_at, unit_at),
+        falls=np.append(crossovers.falls, np.ones(len(unit_at), bool)),
+        phases=np.append(crossovers.phases, np.angle(-_response(system, unit_at))),
+    )
 
 
 def is_stable(system: Transfer) -> bool:
@@ -254,18 +274,18 @@ def _poles_gained(system: Transfer, delays: np.ndarray) -> np.ndarray:
     gained = np.zeros(len(delays))
     # A pair crosses outwards where |L| falls and inwards where |L| rises, again and again with each further turn of the
     # delay, 2 pi/w. `first` is the delay at which a pair of poles is at +-jw, or at the angle +-wT.
-    for w, falls, phase in zip(crossovers.gain_at, crossovers.falls, crossovers.phases, strict=True):
+    for w, falls, phase in zip(crossovers.unit_at, crossovers.falls, crossovers.phases, strict=True):
         first = (phase % (2 * math.pi)) / w
         times = np.where(delays > first, 1 + np.floor((delays - first) * w / (2 * math.pi)), 0)
         gained += 2 * times if falls else -2 * times
     if system.period is not None and abs(_response(system, math.pi / system.period)[0]) >= 1:
-        # Each period brings a pole outside the circle near z = -1, where |L| > 1 joins the ends of the axis.
+        # |L| > 1 at z = -1: there each period of delay brings one more pole outside the circle, without |L| = 1.
         gained += np.round(delays / system.period)
     return gained
 
 
 def unstable_poles(system: Transfer) -> int:
-    """Return the number of unstable poles of a closed loop without delay, those on the stability boundary included.
+    """Return how many of the `closed_loop_poles` are unstable, those on the stability boundary included.
 
     If 1 + D = 0 the closed loop is not well-posed. The result is then the number of states plus 1.
     """
@@ -278,10 +298,13 @@ def unstable_poles(system: Transfer) -> int:
 def closed_loop_poles(system: Transfer) -> np.ndarray:
     """Return the poles (order,) of the closed loop: in z if it is sampled, else in s.
 
-    A delay in continuous time is left out, because it makes infinitely many poles.
+    A delay in continuous time is left out, because it makes infinitely many poles. If 1 + D = 0 the closed loop is not
+    well-posed, and the poles are NaN.
     """
     system = system._replace(delay=0.0) if system.period is None else system.without_delay()
-    return np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0))
+    if not 1 + system.D[0, 0]:
+        return np.full(len(system.A), math.nan)
+    return np.linalg.eigvals(system.A - system.B @ system.C / (1 + system.D[0, 0]))
 
 
 def frequency_grid(system: Transfer) -> np.ndarray:
@@ -325,9 +348,12 @@ def _frequency_range(system: Transfer, sizes: np.ndarray, half: float) -> tuple[
             w = w * 10.0 ** (way * GRID_DECADES)
             if not MIN_FREQUENCY < w < min(half, 1 / MIN_FREQUENCY):
                 break
-            near, far = np.log(np.abs(_response(system._replace(delay=0.0), np.array([w, w * 10.0**way]))))
+            with np.errstate(divide="ignore"):  # L may be 0
+                near, far = np.log(np.abs(_response(system._replace(delay=0.0), np.array([w, w * 10.0**way]))))
+            if not (np.isfinite(near) and np.isfinite(far)):
+                break
             slope = round((far - near) / math.log(10.0))  # of log |L| in the direction away from the poles
-            if not (np.isfinite(near) and slope) or near * slope >= 0:  # constant, or already away from |L| = 1
+            if not slope or near * slope >= 0:  # constant, or already away from |L| = 1
                 break
             crossing = w * math.exp(min(-near / slope, 600.0) * way)
             low, high = (max(crossing, MIN_FREQUENCY), high) if way < 0 else (low, min(crossing, half))
@@ -338,17 +364,18 @@ def _between_crossovers(system: Transfer) -> np.ndarray:
     """Return a frequency between each two neighbours with |L| = 1 [rad/s], and some others.
 
     The frequencies with |L| = 1 are eigenvalues jw of the Hamiltonian matrix. All eigenvalues above the real axis are
-    used, so that no tolerance has to say which are imaginary. Nothing is returned if |L| = 1 at the end of the axis.
+    used, so that no tolerance has to say which are imaginary. The result is empty if |L| = 1 at the end of the axis.
     """
     a, b, c, d = (np.asarray(x, float) for x in system[:4])
     try:
         if system.period is not None:  # s = (z - 1)/(z + 1) maps the unit circle to the imaginary axis
             inverse = np.linalg.inv(a + np.eye(len(a)))
             a, b, c, d = inverse @ (a - np.eye(len(a))), 2 * inverse @ b, c @ inverse, d - c @ inverse @ b
-        short = 1 - d[0, 0] ** 2
+        if not (short := 1 - d[0, 0] ** 2):
+            return np.zeros(0)
         f = a + b @ c * d[0, 0] / short
         s = np.linalg.eigvals(np.block([[f, b @ b.T / short], [-c.T @ c / short, -f.T]]))
-    except (np.linalg.LinAlgError, ZeroDivisionError):
+    except np.linalg.LinAlgError:
         return np.zeros(0)
     w = np.sort(s.imag[s.imag > 0])
     w = np.sqrt(w[1:] * w[:-1])
@@ -381,7 +408,6 @@ def _rational_response(system: Transfer, w: float) -> complex:
 
 
 def _complementary_sensitivity(values: np.ndarray) -> np.ndarray:
-    """Return T; 1 where L is infinite."""
     with np.errstate(all="ignore"):
         return np.where(np.isfinite(values), values / (1 + values), 1.0)
 
@@ -452,7 +478,7 @@ def _is_unstable_with_any_delay(system: Transfer) -> bool:
 
 
 def _is_real(system: Transfer, w: float) -> bool:
-    """Return whether L is finite and real at an end of the frequency axis."""
+    """Return whether L is real at an end `w` of the frequency axis, and below `1/REAL_TOLERANCE`."""
     value = _response(system, w)[0]
     return (
         bool(np.isfinite(value)) and abs(value.imag) <= REAL_TOLERANCE * abs(value) and abs(value) < 1 / REAL_TOLERANCE
@@ -462,7 +488,7 @@ def _is_real(system: Transfer, w: float) -> bool:
 def _gain_margins(crossovers: Crossovers) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the factors nearest to 1, below and above, and their frequencies."""
     low, high, low_at, high_at = 0.0, math.inf, math.nan, math.nan
-    for factor, w in zip(crossovers.factors.tolist(), crossovers.phase_at.tolist(), strict=True):
+    for factor, w in zip(crossovers.factors.tolist(), crossovers.negative_at.tolist(), strict=True):
         if low < factor < 1:
             low, low_at = factor, w
         if 1 < factor < high:
@@ -474,7 +500,7 @@ def _delay_margin(loop: OpenLoop | Transfer, system: Transfer, w: np.ndarray, cr
     """Return the delay margin of a stable loop [s]; `system` is its transfer function on the grid `w`."""
     if _is_unstable_with_any_delay(system):
         return 0.0
-    delays = (crossovers.phases % (2 * math.pi)) / crossovers.gain_at
+    delays = (crossovers.phases % (2 * math.pi)) / crossovers.unit_at
     guess = float(delays.min()) if len(delays) else math.inf
     if loop.period is None:
         return guess
@@ -490,20 +516,20 @@ def _count_margin(loop: Transfer, crosses: bool, end: float) -> float:
     period = float(loop.period or math.nan)
     if not crosses and abs(_response(loop, math.pi / period)[0]) < 1:
         return math.inf
-    # A pair of poles crosses at first + 2 pi k/w, and only the first whole periods after such a delay are asked.
+    # A pair of poles crosses at the delays first + 2 pi k/w. Only the first whole periods after each are examined.
     crossovers = find_crossovers(loop._replace(delay=0.0))
-    ends = [loop.delay + period]
-    for w, phase in zip(crossovers.gain_at, crossovers.phases, strict=True):
+    delays = [loop.delay + period]
+    for w, phase in zip(crossovers.unit_at, crossovers.phases, strict=True):
         turn = 2 * math.pi / w
         first = phase % (2 * math.pi) / w
         start = math.floor(max(loop.delay - first, 0.0) / turn)
-        ends += [first + turn * k for k in range(start, start + math.ceil(end / turn) + 2)]
-    periods = np.unique(np.ceil((np.array(ends) - loop.delay) / period))
+        delays += [first + turn * k for k in range(start, start + math.ceil(end / turn) + 2)]
+    periods = np.unique(np.ceil((np.array(delays) - loop.delay) / period))
     periods = np.union1d(periods, periods + 1)  # a pair that is on the circle has not crossed yet
-    more = periods[(periods >= 1) & (periods <= math.ceil(end / period))] * period
-    now, *late = _poles_gained(loop, np.append(0.0, more) + loop.delay)
-    unstable = np.flatnonzero(np.array(late) > now)
-    return float(more[unstable[0]]) if len(unstable) else math.nan
+    added = periods[(periods >= 1) & (periods <= math.ceil(end / period))] * period
+    present, *gained = _poles_gained(loop, np.append(0.0, added) + loop.delay)
+    unstable = np.flatnonzero(np.array(gained) > present)
+    return float(added[unstable[0]]) if len(unstable) else math.nan
 
 
 def _find_margin(loop: OpenLoop, w: np.ndarray, end: float) -> float:

@@ -381,7 +381,7 @@ def test_a_draft_is_the_run_to_what_can_be_seen(session):
 
 @killed_by(
     "linear.stability_margins",
-    "return np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0))\n\n\ndef frequency_grid",
+    "return np.linalg.eigvals(system.A - system.B @ system.C / (1 + system.D[0, 0]))\n\n\ndef frequency_grid",
     "return np.linalg.eigvals(system.A)\n\n\ndef frequency_grid",
 )
 def test_poles_of_a_closed_loop_are_those_of_its_polynomial():
@@ -684,6 +684,14 @@ def test_a_transient_ends_when_the_signal_has_settled():
     still = found._replace(panels=(Panel("1", (Curve("slip", lines[1].values), lines[1])),))
     assert curves.transient_end(still) == 10.0
     assert charts.change_time_axis(1.23456789) == {"dataZoom": [{"startValue": 0, "endValue": 1.2346}]}
+
+
+@killed_by("output.explore.charts", "poles[np.isfinite(poles)]", "poles")
+def test_a_loop_that_is_not_well_posed_shows_no_poles():
+    nothing = stability.CornerLoops((), np.array([]), {}, 0, 0)
+    loop = stability.Stability(None, 0.0, np.array([np.nan, -1.0]), {}, False, nothing)
+    change = json.loads(json.dumps(charts.change_poles(loop), allow_nan=False))
+    assert [series["data"] for series in change["series"]] == [[], [[-1.0, 0.0]]]
 
 
 @killed_by("output.explore.charts", "third - quarter, high - third", "third - quarter, high - low")

@@ -18,7 +18,8 @@ from scipy.signal import cont2discrete
 
 from diffabs.core.blocks import Series
 from diffabs.linear import Band, OpenLoop, Transfer, band, from_control, margins, open_loop, to_control
-from diffabs.linear.stability_margins import MARGIN_UNITS, find_crossovers, is_stable
+from diffabs.linear.stability_margins import MARGIN_UNITS, closed_loop_poles, find_crossovers, is_stable
+from diffabs.linear.transfer import check_transfer
 from diffabs.parts.actuators import Delay, Lag, RateLimit
 from diffabs.parts.controllers import PID, ConstantTorque, HoldingInput, Relay, Sampled, StateFeedback
 from diffabs.parts.plants import BrakeStart, LabRig, MirroredRig
@@ -49,7 +50,7 @@ def random_loop(seed, sampled):
             a, b = cont2discrete((system.A, system.B, system.C, system.D), period)[:2]  # pyright: ignore
             system = system._replace(A=a, B=b, period=period)
         system = system._replace(C=system.C * draw.uniform(0.5, 4.0))
-        if is_stable(system) and len(find_crossovers(system).gain_at):
+        if is_stable(system) and len(find_crossovers(system).unit_at):
             return system
 
 
@@ -79,17 +80,17 @@ def test_margins_are_those_of_python_control(sampled, seeds):
         if np.max(there, initial=0.0) > 1e-10:
             continue  # roots of polynomials in z lose digits: theirs are none of |L| = 1
         compared += 1
-        np.testing.assert_allclose(np.sort(crossed.gain_at), np.sort(wgc), rtol=1e-8)
+        np.testing.assert_allclose(np.sort(crossed.unit_at), np.sort(wgc), rtol=1e-8)
         np.testing.assert_allclose(math.degrees(found.phase), np.min(np.abs(pm)), rtol=1e-8)
         half = math.pi / system.period if sampled else math.inf
         inner = (wpc > 1e-6) & (wpc < half * (1 - 1e-6))  # ends of the axis are `test_ends_of_the_axis`
-        ours = (crossed.phase_at > 1e-6) & (crossed.phase_at < half * (1 - 1e-6))
+        ours = (crossed.negative_at > 1e-6) & (crossed.negative_at < half * (1 - 1e-6))
         at = system.response(wpc)[:, 0, 0]
         real = np.abs(at.imag) < 1e-10 * np.abs(at)  # and there are some of theirs at which L is not real
         assert len(wpc[inner & ~real]) or np.sum(ours) == np.sum(inner)
         for w, factor in zip(wpc[inner & real], gm[inner & real], strict=True):
-            i = np.argmin(np.abs(crossed.phase_at - w))
-            assert crossed.phase_at[i] == pytest.approx(w, rel=1e-8)
+            i = np.argmin(np.abs(crossed.negative_at - w))
+            assert crossed.negative_at[i] == pytest.approx(w, rel=1e-8)
             assert crossed.factors[i] == pytest.approx(factor, rel=1e-8)
         if len(sm):
             assert found.modulus <= np.min(sm) * (1 + 1e-12)
@@ -230,7 +231,7 @@ def test_a_large_direct_path_bears_no_delay(direct):
 
 
 @killed_by("linear.stability_margins", "gained += np.round(delays / system.period)", "pass")
-@killed_by("linear.stability_margins", "return float(more[unstable[0]])", "return float(more[0])")
+@killed_by("linear.stability_margins", "return float(added[unstable[0]])", "return float(added[0])")
 @pytest.mark.parametrize("count", cases([12, 200], 200))
 def test_a_sampled_loop_bears_the_periods_of_its_margin(count):
     """Poles with n periods of delay are the roots of z^n (z - p) + D (z - p) + r. Many loops have |L| > 1 at z = -1."""
@@ -376,7 +377,7 @@ def test_close_crossings_are_both_found():
     # |L| = 1 where w0^2 - w^2 = +-w sqrt(k^2 - (2 z w0)^2)
     half = math.sqrt(k**2 - (2 * z * w0) ** 2) / 2
     wanted = np.array([-half, half]) + math.hypot(w0, half)
-    np.testing.assert_allclose(find_crossovers(loop).gain_at, wanted, rtol=1e-7)
+    np.testing.assert_allclose(find_crossovers(loop).unit_at, wanted, rtol=1e-7)
     assert margins(loop).delay == pytest.approx(math.pi / w0, rel=1e-3)
 
 
@@ -694,7 +695,7 @@ def test_a_crossover_far_below_a_pole_is_found(k):
     assert (found.crossover, found.phase) == pytest.approx((w, np.arctan(1 / w)), rel=1e-9)
 
 
-@killed_by("linear.stability_margins", "crossovers = _touch_unit_circle(system, w, crossovers)", "pass")
+@killed_by("linear.stability_margins", "crossovers = _add_touches(system, w, crossovers)", "pass")
 def test_a_gain_that_only_reaches_one_has_a_phase_margin():
     """A sampled gain of 1 is 180 deg from -1 at every frequency; 2 s/(s + 1)^2 is 1 at 1 rad/s and less elsewhere."""
     found = margins(static(1.0, period=0.1))
@@ -703,6 +704,46 @@ def test_a_gain_that_only_reaches_one_has_a_phase_margin():
     found = margins(Transfer(a, b, 2 * np.array([[-1.0, 1.0]]), np.zeros((1, 1))))  # s = (s + 1) - 1
     assert (found.phase, found.phase_at, found.delay) == pytest.approx((np.pi, 1.0, np.pi), rel=1e-6)
     assert np.isinf(margins(static(0.999, period=0.1)).phase)
+
+
+@killed_by("linear.stability_margins", "(values < after) & (values < NEAR_UNIT)", "(values < after) & (values < 0.0)")
+def test_a_peak_that_reaches_one_counts_beside_a_crossing():
+    """|D(jw)|^2 = x^3 - 9 x^2 + 24 x, x = w^2, is 16 at x = 1 and touches 16 at x = 4: the phase margin of 4/D."""
+    b, gain = math.sqrt(24), 4 * (1 - 1e-13)  # rounding cannot make a crossing of the touch
+    a = math.sqrt(2 * b - 9)
+    states = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -b, -a]])
+    found = margins(Transfer(states, np.eye(3)[:, 2:], gain * np.eye(3)[:1], np.zeros((1, 1))))
+    touch = math.pi / 2 - math.atan2(2 * a, b - 4)
+    assert found.stable
+    assert (found.phase, found.phase_at, found.crossover) == pytest.approx((touch, 2.0, 2.0), rel=1e-6)
+
+
+@killed_by("linear.stability_margins", "if not (np.isfinite(near) and np.isfinite(far)):", "if False:", case="late")
+@pytest.mark.parametrize(
+    "loop",
+    [
+        Transfer([[-1.0]], [[1.0]], [[0.0]], [[0.0]]),
+        Transfer([[-1.0]], [[1.0]], [[0.0]], [[0.0]], delay=0.1),
+        Transfer([[0.5]], [[1.0]], [[0.0]], [[0.0]], period=0.1),
+        static(0.0),
+        static(0.0, period=0.1),
+    ],
+    ids=["continuous", "late", "sampled", "constant", "sampled constant"],
+)
+def test_a_loop_without_a_path_has_no_limits(loop):
+    """L = 0, as with a gain of zero."""
+    found = margins(loop)
+    assert found.stable
+    assert (found.gain, found.phase, found.delay) == ((0.0, np.inf), np.inf, np.inf)
+    assert (found.modulus, found.sensitivity, found.complementary) == (1.0, 1.0, 0.0)
+    assert math.isnan(found.crossover)
+
+
+@killed_by("linear.stability_margins", "return np.full(len(system.A), math.nan)", "pass")
+def test_a_loop_that_is_not_well_posed_has_no_poles():
+    loop = Transfer([[-1.0]], [[1.0]], [[0.5]], [[-1.0]])
+    assert np.isnan(closed_loop_poles(check_transfer(loop))).all()
+    assert not margins(loop).stable
 
 
 @killed_by("linear.transfer", "np.expm1(1j * w * self.period)", "np.exp(1j * w * self.period) - 1", case="1e-09-0.001")
@@ -715,13 +756,17 @@ def test_a_fast_sampled_integrator_has_the_margins_of_its_formula(period, k):
     assert found.delay == pytest.approx(np.ceil((np.pi - w * period) / 2 / (w * period)) * period, rel=1e-7)
 
 
-@killed_by("linear.stability_margins", '"inf" if value == math.inf else float(value)', "float(value)")
+@killed_by("linear.stability_margins", "None if math.isnan(value) else float(value)", "float(value)")
+@killed_by("linear.stability_margins", '"inf" if value == math.inf else', "")
 def test_a_record_of_margins_is_plain_json_with_a_unit_for_each_number():
     limits = margins(Transfer([[-1.0]], [[1.0]], [[1.0]], [[0.0]]))
     record = json.loads(json.dumps(limits.record()))
     assert record["gain_up"] == "inf"
     assert set(record) == {"stable", *MARGIN_UNITS}
     assert record["modulus"] * record["sensitivity"] == pytest.approx(1.0, rel=1e-15)
+    unstable = margins(Transfer([[1.0]], [[1.0]], [[0.5]], [[0.0]]))
+    record = json.loads(json.dumps(unstable.record(), allow_nan=False))
+    assert record == {"stable": False, **dict.fromkeys(MARGIN_UNITS)}
 
 
 @killed_by("linear.robustness", 's.margins.record()[name], "values"', 's.margins.record()["modulus"], "values"')

@@ -156,6 +156,7 @@ def change_poles(stability: Stability | None) -> JsonObject:
 
 def _points(values: np.ndarray, period: float | None) -> list[list[float]]:
     poles = np.asarray(values, complex)
+    poles = poles[np.isfinite(poles)]  # a loop that is not well-posed has none
     if period is not None:
         poles = np.log(poles[np.abs(poles) > 1e-9]) / period  # a pole at z = 0 is a delay; its logarithm is -inf
     return [[float(f"{p.real:.5g}"), float(f"{p.imag:.5g}")] for p in poles]
