@@ -118,12 +118,12 @@ class Series:
 
 
 def offers(block: object, *hooks: str) -> bool:
-    """Return whether a block has at least one of these optional methods; without names, `tick` or `margins`.
+    """Return whether a block has at least one of these optional methods.
 
     A block with a method `offers(hook)`, such as `Series`, answers for the blocks in it.
     """
     nested_offers = getattr(block, "offers", None)
-    return any(nested_offers(hook) if nested_offers else hasattr(block, hook) for hook in hooks or ("tick", "margins"))
+    return any(nested_offers(hook) if nested_offers else hasattr(block, hook) for hook in hooks)
 
 
 def next_tick(block: Part, k: Int, h: Scalar) -> Scalar:

@@ -157,7 +157,7 @@ class Switching(Block, Protocol):
         ...
 
     def event(self, t: Scalar, memory: Memory, signal: PyTree, fired: tuple[PyTree, ...]) -> Memory:
-        """Return the memory after the events whose `fired` is true."""
+        """Return the memory after the events whose `fired` is true; `signal` is the input before the instant."""
         ...
 
 

@@ -55,7 +55,7 @@ class LoopState(NamedTuple):
         return [memory.held for memory in self[1:]]
 
     def with_flow(self, flow: tuple[PyTree, ...]) -> "LoopState":
-        """Return the state with the continuous memories in `flow` and the same held memories."""
+        """Return the state with plant state and continuous memories from `flow`, and the same held memories."""
         return LoopState(flow[0], *(m._replace(flow=f) for m, f in zip(self[1:], flow[1:], strict=True)))
 
 
@@ -78,7 +78,7 @@ class Signals(NamedTuple):
 AUDIT_METRIC = ""  # name of a plant's audit among the objectives; no metric has an empty name
 BLOCKS = ("sensor", "reference", "controller", "actuator")
 LOOP_SIGNALS = tuple(name for name in Sample._fields if name not in ("t", "output"))
-# Names that files and proofs give to other signals of a loop, and to their own columns and variables.
+# Names that no output of a plant may have: files and proofs use them for other signals, columns and variables.
 RESERVED_SIGNALS = {*LOOP_SIGNALS, "t", "time", "sample", "metrics", "units"}
 
 
@@ -158,12 +158,12 @@ class Loop(LoopParts):
         )
 
     def project(self, state: LoopState) -> LoopState:
-        """Return the state with that of the plant admissible."""
+        """Return the state with the plant state projected onto the plant's admissible states."""
         return state._replace(plant=self.plant.project(state.plant))
 
     def join_state(self, flow: tuple[PyTree, ...], held: list[PyTree]) -> LoopState:
-        """Return the state of `LoopState.flow` and `LoopState.memories`."""
-        return LoopState(flow[0], *(Memory(*parts) for parts in zip(flow[1:], held, strict=True)))
+        """Return the state that has this `LoopState.flow` and these `LoopState.memories`."""
+        return LoopState(flow[0], *(Memory(*pair) for pair in zip(flow[1:], held, strict=True)))
 
     def error_controlled_signals(self, state: LoopState) -> Scalar:
         """Return the plant's first output."""
@@ -172,7 +172,7 @@ class Loop(LoopParts):
     @property
     def changes(self) -> bool:
         """Whether a block has ticks or events."""
-        return any(offers(getattr(self, name)) for name in BLOCKS)
+        return any(offers(getattr(self, name), "tick", "margins") for name in BLOCKS)
 
     @property
     def ticks(self) -> bool:
@@ -195,7 +195,7 @@ class Loop(LoopParts):
     @property
     def jumps(self) -> bool:
         """Whether a part of the loop declares that a rate in the flow jumps where a comparison changes."""
-        return any(_jumps(getattr(self, name)) for name in ("plant", *BLOCKS))
+        return any(_jumps(getattr(self, name)) for name in ("plant", "feedforward", *BLOCKS))
 
     @property
     def recorders(self) -> tuple[str, ...]:
@@ -228,18 +228,19 @@ class Loop(LoopParts):
         """Return the state after an instant, of the state, signals and margins before it.
 
         Each block, in the order of the signal, has its events, records the step that ends here (`passed`), and has its
-        tick. An event also occurs if the change of an earlier block makes a margin negative. The test covers both ends
-        of the signal's jump, with the jump as the rate. So the margin of a maximum sees the fall.
+        tick. An event also occurs if the change of an earlier block makes the input jump so that a margin turns
+        negative. The margin is tested with the input before and after the jump, and with the jump as the rate. A margin
+        that is the input's rate thus also detects a maximum. `event` gets the input before the instant.
         """
-        was, moved = _block_inputs(before), False
+        was, input_may_jump = _block_inputs(before), False
 
         def change_block(name: str, signal: object) -> Memory:
-            nonlocal state, moved
+            nonlocal state, input_may_jump
             block, memory = getattr(self, name), getattr(state, name)
             if name in fired:
                 happens = fired[name]
-                if moved:
-                    # An earlier block has changed at this instant, so the input may jump across a margin's zero.
+                if input_may_jump:
+                    # An earlier block with ticks or events may have changed, and the input may cross a margin's zero.
                     jump = jax.tree.map(jnp.subtract, signal, was[name])
                     ends = (block.margins(clock.t, memory, end, lambda: jump) for end in (was[name], signal))
                     crossed = zip(happens, margins[name], *ends, strict=True)
@@ -249,7 +250,7 @@ class Loop(LoopParts):
                 memory = block.record(memory, passed[name])
             if offers(block, "tick"):
                 memory = block.tick(clock._replace(before=was[name]), memory, signal)
-            moved = moved or offers(block)
+            input_may_jump = input_may_jump or offers(block, "tick", "margins")
             state = state._replace(**{name: memory})
             return memory
 
@@ -272,10 +273,10 @@ class Loop(LoopParts):
 
 
 def _jumps(component: object) -> bool:
-    """Return whether a part, or a part in it, declares jumps; a block without a flow has nothing to integrate."""
-    if getattr(type(component), "flow", None) is no_flow:
-        return False
-    return getattr(component, "jumps", False) or any(map(_jumps, parts(component)))
+    """Return whether a part declares jumps, or a part in it, unless the outer one integrates nothing."""
+    if getattr(component, "jumps", False):
+        return True
+    return getattr(type(component), "flow", None) is not no_flow and any(map(_jumps, parts(component)))
 
 
 def _block_inputs(signals: Signals) -> dict[str, PyTree]:

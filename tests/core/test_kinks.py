@@ -433,6 +433,25 @@ def test_where_a_rate_jumps_a_value_is_right_too(late):
 
 
 @pytree
+class DeclaredFeedforward:
+    jumps = True
+
+    def input(self, plant, measured, setpoint):
+        return jnp.where(setpoint > 0.0, 1.0, 0.0)
+
+
+@killed_by("loop.closed_loop", 'for name in ("plant", "feedforward", *BLOCKS))', 'for name in ("plant", *BLOCKS))')
+def test_an_output_that_jumps_makes_the_plants_rate_jump():
+    """Also if the part integrates nothing itself."""
+    loop, _ = integrating(0.0)
+    plain = Loop(**{**vars(loop), "controller": PID()})
+    memoryless = type("DeclaredTorque", (ConstantTorque,), {"jumps": True})
+    assert not plain.jumps
+    assert Loop(**{**vars(plain), "feedforward": DeclaredFeedforward()}).jumps
+    assert Loop(**{**vars(plain), "controller": memoryless()}).jumps
+
+
+@pytree
 class Pulsed(Clockwork):
     """y' = 1, and 3 from an instant to another one, both known in advance."""
 

@@ -384,7 +384,7 @@ def test_a_whole_run_is_what_the_exported_controller_does(name, tmp_path):
     np.testing.assert_allclose(result, np.asarray(run.trajectory.sample.command)[:count], rtol=1e-12, atol=1e-12)
 
 
-@killed_by("output.export.device", "if offers(reference) or moves:", "if False:")
+@killed_by("output.export.device", 'if offers(reference, "tick", "margins") or moves:', "if False:")
 @needs_cc
 def test_the_target_can_come_from_outside(tmp_path):
     loop = rig(PID(kp=60.0, ki=400.0, low=0.0, high=90.0), reference=PeakLatch())

@@ -242,7 +242,7 @@ def _check_reference(loop: Loop, measured: object) -> None:
     reference, name = loop.reference, type(loop.reference).__name__
     memory = reference.start(measured)
     moves = depends_on_signal(lambda y: (reference.flow(0.0, memory, y), reference.output(0.0, memory, y)), measured)
-    if offers(reference) or moves:
+    if offers(reference, "tick", "margins") or moves:
         raise NotExported(f"reference {name} follows what is measured between samples: give the target from outside")
 
 
