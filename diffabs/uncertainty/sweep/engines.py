@@ -36,15 +36,19 @@ class ComputedChunk(NamedTuple):
 
 
 class Engine(Protocol):
-    """A computer of chunks, in any order."""
+    """A computer of chunks, in any order.
+
+    An engine whose chunks may be computed on other machines has the attribute `remote = True`: XLA then makes the runs
+    of a study with the engine "auto".
+    """
 
     def run(
         self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]
     ) -> Generator[ComputedChunk, None, None]:
         """Yield each of the `chunks` of a `study` once.
 
-        After `stopping()` returns true, no new chunk begins, and the chunks in progress are still yielded. If the
-        generator is closed, they are discarded.
+        `stopping()` is called before more chunks begin. After it returns true, no new chunk begins, and the chunks in
+        progress are still yielded. If the generator is closed, they are discarded.
         """
         ...
 

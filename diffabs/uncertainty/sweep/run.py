@@ -25,14 +25,14 @@ from diffabs.uncertainty.sweep.study import Study
 
 
 class SweepProgress(NamedTuple):
-    """Progress of a sweep.
+    """Progress of a sweep, in samples; each is one run, or is refused without a run.
 
     Attributes:
         samples: Number of finished samples, those of earlier calls included.
         total: Number of samples of the sweep.
         here: Number of samples that this call has finished.
-        seconds: Time of this call [s]; the time to compile is left out after `stopwatch.count_compilations`.
-        failed: Number of failed runs of this call.
+        seconds: Time of this call [s], without the time to compile if `stopwatch.count_compilations` was called before.
+        failed: Number of failed runs of this call, diverged ones included.
         diverged: Number of diverged runs of this call.
         damaged: Numbers of the damaged chunks, which are computed again.
         refused: Number of samples of this call that were not run.
@@ -48,16 +48,16 @@ class SweepProgress(NamedTuple):
     refused: int = 0
 
     def __str__(self) -> str:
-        """Return the progress in a few words."""
+        """Return the progress in a few words, with the time."""
         failed = f", {self.failed} failed" if self.failed else ""
-        return f"sweep: {self.samples:,} of {self.total:,} runs{failed}, {self.seconds:.0f} s"
+        return f"sweep: {self.samples:,} of {self.total:,} samples{failed}, {self.seconds:.0f} s"
 
     def describe_count(self) -> str:
-        """Return the numbers of samples so far on one line, without times; before the first chunk it is compiling."""
+        """Return the numbers of samples and the rate on one line; before the first chunk, that it is compiling."""
         words = f"{self.samples:,} of {self.total:,}"
         if not self.here:
-            return f"{words}, compiling"
-        words += f": {self.rate:,.0f}/s, {self.failed:,} failed, {self.diverged:,} diverged"
+            return f"{words}, compiling" if self.samples < self.total else words
+        words += f": {self.rate:,.0f}/s, {self.failed:,} failed, {self.diverged:,} of them diverged"
         return f"{words}, {self.refused:,} refused" if self.refused else words
 
     def describe_damage(self) -> str:
@@ -83,23 +83,28 @@ def sweep(
     stopping: Callable[[], bool] = lambda: False,
     source: Table | None = None,
 ) -> Results:
-    """Compute every chunk of a study that the folder lacks, and return the results.
+    """Compute the missing chunks of a study, and return the results.
 
-    One process sweeps into a folder, and holds its lock. Several machines compute the chunks with `on=Dask(...)`.
+    A chunk is up to `Study.chunk` samples, which are computed together and written as one file. One process sweeps into
+    a folder, and holds its lock. Several machines compute the chunks with `on=Dask(...)`. If `stopping` ends the sweep,
+    the results lack the other chunks, and `Results.complete` is false.
 
     Args:
-        study: Study to run. For its engine "auto", the log says once why XLA makes the runs, if it does.
+        study: Study to run. `study.engine`, XLA or a kernel, makes the runs. For "auto", the log says once why XLA
+            makes them, if it does.
         out: Folder for the results; it is created.
-        resume: Continue with a folder that already contains chunks of this study.
-        on: Engine that computes the chunks; None is every device of this process.
+        resume: Continue with a folder that already contains chunks of this study. Damaged ones are deleted and computed
+            again.
+        on: Devices or cluster that compute the chunks, `Local` or `Dask`; None is every device of this process.
         progress: Function that is called with the progress at the start and after every chunk. None shows a line in a
             notebook and in an interactive session.
-        stopping: Function that is called after every chunk; True ends the run, and `resume` continues it later.
+        stopping: Function that is called before more chunks begin, which may be several at a time. After True none
+            begins, and those in progress are written. `resume` continues later.
         source: Texts for the manifest, by name, such as the scenario.
 
     Raises:
-        ValueError: `study` is no Study or cannot be run, or not by its engine; a note of `source` is no text; or JAX
-            runs in several processes.
+        ValueError: `study` is no Study, cannot be run, or its engine cannot run it; a note of `source` is no text; or
+            JAX runs in several processes.
         SweepError: The folder contains something else, is in use, or cannot be written.
         OSError: The disk is full. Finished chunks stay, and `resume` continues.
 
@@ -116,7 +121,7 @@ def sweep(
             s/sqrt(n),   s^2 = sum (m_i - mean)^2/(n - 1)
 
         if the design draws them independently. Scrambled Sobol and Latin hypercube designs often have a smaller one.
-        Intervals of means follow the skewness of the samples. Source: P. Hall, On the removal of skewness by
+        Intervals of means are asymmetric, as the samples are. Source: P. Hall, On the removal of skewness by
         transformation, J. R. Stat. Soc. B 54 (1992). A chunk's file contains its checksum in its name, and one program
         computes every chunk, so that an interrupted and an uninterrupted sweep are equal to the bit.
 
