@@ -1,12 +1,15 @@
 """The tuning problem as a function of the unbounded vector z: loss, gradient and admissibility.
 
-    J(z) = aggregate over the runs of (sum of weight * metric)
+    J(z) = aggregate over the runs of (run weight * sum of metric weight * metric)
     L(z) = J/s + sum over the constraints of [max(0, m + c (g + d))^2 - m^2]/(2 c)
 
 L is the augmented Lagrangian of Powell, Hestenes and Rockafellar for g + d <= 0, with multipliers m and penalty c. The
-scale s is the magnitude of the objective at the start, so that L is of the order of one. The margin d moves the target
-a little inside the feasible set. Iterates of the method of multipliers approach a bound from outside and do not quite
-reach it. With the margin, g <= 0 holds at the end of a search.
+scale s is the magnitude of the objective at the start, so that L is of the order of one. Iterates of the method of
+multipliers approach a bound from outside and do not quite reach it. The margin d moves the bound a little inside the
+feasible set, so that the end of a search usually has g <= 0; `Tuned.met` says whether it does.
+
+A search has several starts: values of z, each with a descent of its own. Functions of all starts take z of shape
+(starts, p).
 """
 
 import dataclasses
@@ -22,7 +25,7 @@ from diffabs.core.bijectors import FreeSpace
 from diffabs.core.compiling import SAME_RESULT_OPTIONS
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes
-from diffabs.core.types import AnyArray, Array, Bool, Int, Part, PyTree, Scalar, Vector
+from diffabs.core.types import AnyArray, Array, Int, Part, PyTree, Scalar, Vector
 from diffabs.engine.drive.deferred import MANY_INPUTS_REASON, find_kernels
 from diffabs.engine.solvers import Solver
 from diffabs.loop.admissible import batch_admissibility, first_refusal
@@ -35,7 +38,7 @@ from diffabs.tune.method import DerivativeMode
 from diffabs.tune.result import build_subject_loop
 from diffabs.tune.risk import Aggregate
 
-MAX_QUICK_COMPILE_RUNS = 64  # above this number of runs, a fully optimised compilation pays for itself
+MAX_QUICK_COMPILE_RUNS = 64  # above this number of runs, XLA's default options pay for their longer compilation
 MAX_FORWARD_PARAMETERS = 6  # parameters up to which forward mode is cheaper (benchmarks/bench_gradient.py)
 
 
@@ -46,7 +49,7 @@ class ObjectiveEvaluation(NamedTuple):
 
     objective: Any
     excess: Array
-    diverged: Bool
+    diverged: Int
     metrics: dict[str, PyTree]
     slid: Int = 0
 
@@ -60,7 +63,10 @@ class LossEvaluation(NamedTuple):
 
 
 class Multipliers(NamedTuple):
-    """The multipliers (k,), penalty and margin of the augmented Lagrangian; a margin of None means zero."""
+    """The multipliers (k,), the penalty, a number, and the margin d, a number or None for zero.
+
+    With several starts each has a leading axis of starts.
+    """
 
     values: np.ndarray
     penalty: np.ndarray
@@ -76,12 +82,12 @@ class Problem:
             determines a loop, for example LQ weights.
         space: Map from the unbounded vector z to the free parameters.
         solver: Solver of every run.
-        measured: Objectives by metric.
-        weights: Weights of the metrics in the objective.
+        measured: What computes each metric from a run, by the name of the metric.
+        weights: Weights of the metrics in J, at least one.
         batch: The runs.
-        aggregate: Map from one number for each run to one number.
+        aggregate: Map from one number for each run to J.
         constraints: Constraints on the loop and its metrics.
-        mode: Mode of differentiation.
+        mode: Forward or reverse mode of differentiation.
         engine: Engine of the runs, "xla", "kernel" or "auto".
     """
 
@@ -116,7 +122,7 @@ class Problem:
         if kernels := find_kernels(self._evaluate.trace(z, none, 1.0).jaxpr):
             reason = next((reason for _, reason in kernels if reason), "")
             return ("xla" if reason else "kernel"), reason
-        # XLA's reverse mode leaves no run in the program, so the values are asked for the reason.
+        # The program of a reverse derivative by XLA has no mark of a run, so the program of the values has the reason.
         reasons = [
             reason or MANY_INPUTS_REASON for _, reason in find_kernels(jax.make_jaxpr(jax.vmap(self.evaluate))(z))
         ]
@@ -129,7 +135,6 @@ class Problem:
         """
         runs = self.runs(z)
         each = sum(weight * runs.metrics[name] for name, weight in self.weights.items())
-        # Weights of runs multiply before the aggregate; a batch without weights counts each run once.
         each = each if self.batch.weights is None else each * jnp.asarray(self.batch.weights)
         loop = build_subject_loop(self.space.at(self.subject, z))
         excess = self._excess(loop, runs.metrics)
@@ -151,7 +156,10 @@ class Problem:
         return jnp.concatenate(excess) if excess else jnp.zeros(0)
 
     def loss(self, scale: Scalar) -> Callable[[PyTree, Multipliers], tuple[PyTree, tuple[PyTree, ObjectiveEvaluation]]]:
-        """Return the function (z, multipliers) -> (L, (L, evaluation)) for an objective divided by `scale`."""
+        """Return the function (z, multipliers) -> (L, (L, evaluation)) for an objective divided by `scale`.
+
+        L is both the value to differentiate and, for the caller of `jax.grad(..., has_aux=True)`, a result beside it.
+        """
 
         def loss(z: AnyArray, m: Multipliers) -> tuple[PyTree, tuple[PyTree, ObjectiveEvaluation]]:
             evaluation = self.evaluate(z)
@@ -188,9 +196,10 @@ class Problem:
         return first_refusal(build_subject_loop(self.subject), self.batch.values, self.solver)
 
     def steady(self) -> Callable[[np.ndarray], np.ndarray]:
-        """Return the compiled function z (starts, p) -> mask (starts,) of the starts at which every run is admissible.
+        """Return the function z (starts, p) -> mask (starts,) of the starts at which every run is admissible.
 
-        A run is admissible if it meets the rules of its parts and its integration step is stable.
+        A run is admissible if it meets the rules of its parts and its integration step is stable. It need not be in a
+        steady state. The function runs on the host and cannot be traced.
         """
 
         def loops(z: AnyArray) -> Loop:

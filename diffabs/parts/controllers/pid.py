@@ -1,14 +1,9 @@
 """PID control of the plant's first signal, with filtered derivative and limits.
 
-    u = clamp(ff + kp (b r - y) + kI I + kD wc (c r - y - d), low, high)
-    I' = r - y,   d' = wc (c r - y - d)                                     r: target, y: signal
-
 P, PI and PD controllers are special cases with gains of zero. Negative gains are reverse action, for a signal that a
-positive control lowers: cooling, for example. The set-point weights b and c change the response to the target only;
-that to disturbances and the margins of the loop stay. With b = 0 and c = 0 the target acts through the integral alone.
+positive command lowers: cooling, for example. With b = 0 and c = 0 the target acts through the integral alone.
 
-Sources: Aoki and Nakamura, eq. (13), for b = c = 1: C(s) = kp + kI/s + kD s wc/(s + wc). Their u has the opposite
-sign; here a positive u brakes. Astrom and Hagglund, PID Controllers, 2nd ed., sec. 3.4, for b and c.
+The u of Aoki and Nakamura has the opposite sign; here a positive u brakes.
 """
 
 from collections.abc import Iterator
@@ -38,7 +33,7 @@ class PIDMemory(NamedTuple):
 
 @pytree
 class PID:
-    """u = clamp(ff + kp (b r - y) + kI I + kD wc (c r - y - d), low, high), with any sign of the gains.
+    """A PID controller with feed-forward, set-point weights, filtered derivative and limits, and gains of either sign.
 
     See also:
         `controllers.Clamping`, `controllers.BackCalculation`: Anti-windup strategies.
@@ -52,8 +47,12 @@ class PID:
             u = clamp(ff + kp (b r - y) + kI I + kD wc (c r - y - d), low, high)
             I' = r - y,   d' = wc (c r - y - d)
 
-        so the derivative part is kD s wc/(s + wc). The set-point weights b and c change the response to the target
-        only; that to disturbances and the margins of the loop stay. Sources: Aoki and Nakamura, eq. (13), without
+        so the derivative part is kD s wc/(s + wc). At a limit, an anti-windup strategy changes I'. The set-point
+        weights b and c change only the response to the target. They change neither the response to disturbances nor the
+        margins of the loop. I and d start at zero, so the command begins with the derivative part kD wc (c r - y).
+
+        The defaults of kp and wc belong to the quarter car of the first source (scenario `slip-estimator`). Sources: T.
+        Aoki and Y. Nakamura, Anti-lock Brake System based on the Maximum Sliding Frictional Force, eq. (13), without
         weights; K. J. Astrom and T. Hagglund, PID Controllers: Theory, Design, and Tuning, 2nd ed., 1995, sec. 3.4, for
         the weights.
 
@@ -85,28 +84,28 @@ class PID:
     cutoff: Scalar = param(default=55.0, unit="rad/s", above=0.0)
     """Corner frequency wc of the derivative's low-pass filter."""
     low: Scalar = param(default=-np.inf, unit="control", below=np.inf, infinite=True)
-    """Lower limit of the control."""
+    """Lower limit of the command."""
     high: Scalar = param(default=np.inf, unit="control", above=-np.inf, infinite=True)
-    """Upper limit of the control."""
+    """Upper limit of the command."""
     antiwindup: Part = part(default=NoAntiWindup)
     """Anti-windup strategy of the integral."""
 
     def start(self, signal: Tracking) -> Memory:
-        """Return the memory with integral and filter at zero."""
         zero = 0.0 * signal.measured[0]
         return Memory(flow=PIDMemory(zero, zero))
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> PIDMemory:
-        """Return I' [signal], as modified by the anti-windup strategy, and d' [signal/s]."""
-        raw, limited = self._torque(memory, signal)
+        """Return I' [signal], as changed by the anti-windup strategy, and d' [signal/s]."""
+        raw, limited = self._commands(memory, signal)
         integral = self.antiwindup.rate(signal.target - signal.measured[0], self.ki, raw, limited)
         return PIDMemory(integral, self._filter_rate(memory, signal))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Return the limited control, in the plant's unit."""
-        return self._torque(memory, signal)[1]
+        """Return the limited command, in the unit of the plant's control."""
+        return self._commands(memory, signal)[1]
 
-    def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
+    def _commands(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
+        """Return the command before and after the limits."""
         proportional = self.kp * (self.b * signal.target - signal.measured[0])
         derivative = self.kd * self._filter_rate(memory, signal)
         raw = signal.feedforward + proportional + self.ki * memory.flow.integral + derivative
@@ -117,11 +116,9 @@ class PID:
         return self.cutoff * (self.c * signal.target - signal.measured[0] - memory.flow.filtered)
 
     def limits(self) -> tuple[Scalar, Scalar]:
-        """Return the lower and the upper limit of the control."""
         return self.low, self.high
 
     def rules(self) -> Iterator[Rule]:
-        """Yield the rule low <= high."""
         yield order_rule(("low", self.low), ("high", self.high), "{control}")
 
     def cautions(self) -> Iterator[str]:
