@@ -66,6 +66,9 @@ def sweep(
             jax.config.update("jax_num_cpu_devices", devices)
         if out:
             _check_free(out, resume)  # before anything is compiled
+        from diffabs.uncertainty.sweep.checking import accuracy_warnings
+        from diffabs.uncertainty.sweep.selection import choose_study_engine
+
         setup = console.load_scenario(
             scenario, console.add_option_overrides(changes, "sweep", samples=samples, seed=seed)
         )
@@ -75,7 +78,10 @@ def sweep(
         show_samples.say_unused_seed(setup)
         if figures:
             report.check_target(out / report.DEFAULT_NAME)
-        study = _with_engine(section_sweep.build_study(setup), engine, out, resume, remote=scheduler is not None)
+        study = dataclasses.replace(section_sweep.build_study(setup), engine=engine).check()
+        study = engines.choose_engine(
+            lambda: choose_study_engine(study, out, resume=resume, remote=scheduler is not None)
+        )
         numbers = sweep_options.read_sample_numbers(keep, study.samples)
         for number in numbers:
             study.accepted_lane(number)  # raises for a refused sample
@@ -95,8 +101,6 @@ def sweep(
                     "writing the results",
                 )
         show_result()
-        from diffabs.uncertainty.sweep.checking import accuracy_warnings
-
         for line in accuracy_warnings(result["accuracy"]) if result["accuracy"] else ():
             console.say(f"warning: {line}")
         if result["refused"]["count"] == result["samples"]:
@@ -126,23 +130,6 @@ def _check_free(out: pathlib.Path, resume: bool) -> None:
 
     if not resume:
         Store(out).check_free()
-
-
-def _with_engine(study: "Study", engine: str, out: pathlib.Path, resume: bool, remote: bool) -> "Study":
-    """Return the study with its engine, "xla" or "kernel". A line on stderr says why "auto" became XLA."""
-    from diffabs.uncertainty.sweep.runner import find_study_objection
-    from diffabs.uncertainty.sweep.selection import choose_study_engine
-
-    study = engines.choose_engine(
-        lambda: choose_study_engine(
-            dataclasses.replace(study, engine=engine).check(), out, resume=resume, remote=remote
-        )
-    )
-    if study.engine == "kernel" and (
-        line := console.run_with_progress(lambda: find_study_objection(study), engines.COMPILING_KERNEL)
-    ):
-        console.fail(line)
-    return study
 
 
 def _run(study: "Study", scenario: Scenario, out: pathlib.Path, resume: bool, on: Callable[[], PyTree]) -> "Results":

@@ -322,7 +322,7 @@ class TestSweep:
         chosen, why = choose_study_engine(study, tmp_path, remote=True)
         assert (chosen.engine, why) == ("xla", REMOTE_REASON)
 
-    @killed_by("uncertainty.sweep.run", 'if study.engine != "xla" and', "if False and")
+    @killed_by("uncertainty.sweep.selection", 'if study.engine == "kernel" and', "if False and")
     def test_is_refused_before_anything_is_written(self, tmp_path, monkeypatch):
         monkeypatch.setenv(toolchain.COMPILER, "")
         native._run.clear_cache()
@@ -331,8 +331,7 @@ class TestSweep:
             sweep(dataclasses.replace(study, engine="kernel"), tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
-    @killed_by("cli.sweep", "study, engine=engine).check()", "study).check()", case="kernel-")
-    @killed_by("cli.sweep", '    if study.engine == "kernel" and (', "    if False and (", case="kernel-")
+    @killed_by("cli.sweep", "build_study(setup), engine=engine)", "build_study(setup))", case="kernel-")
     @killed_by("cli.engine", "    if why:\n", "    if False:\n", case="auto-note: runs are made by XLA:")
     @pytest.mark.slow
     @pytest.mark.parametrize(("engine", "line"), [("auto", "note: runs are made by XLA:"), ("kernel", "")])

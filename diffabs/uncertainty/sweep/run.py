@@ -18,7 +18,6 @@ from diffabs.loop.closed_loop import Loop
 from diffabs.uncertainty.sweep.engines import Engine, Local
 from diffabs.uncertainty.sweep.manifest import Seals, describe_owner, read_notes
 from diffabs.uncertainty.sweep.results import Results
-from diffabs.uncertainty.sweep.runner import find_study_objection
 from diffabs.uncertainty.sweep.selection import choose_study_engine
 from diffabs.uncertainty.sweep.store import Store
 from diffabs.uncertainty.sweep.study import Study
@@ -151,8 +150,6 @@ def sweep(
     study, why_xla = choose_study_engine(study, out, resume=resume, remote=getattr(on, "remote", False))
     if why_xla:
         log_xla_reason(why_xla)
-    if study.engine != "xla" and (line := find_study_objection(study)):
-        raise ValueError(line)
     with _begin_sweep(store, study, resume, notes) as (missing, damaged), ProgressLine() as shown:
         tell, begun = report_to(shown, progress, str) or (lambda _: None), time.monotonic()
         before = study.samples - sum(b - a for a, b in map(study.bounds, missing))

@@ -11,6 +11,7 @@ from diffabs.engine.drive.engine import resolve_request
 from diffabs.engine.drive.sharding import describe_placement
 from diffabs.uncertainty.sweep.manifest import read_manifest
 from diffabs.uncertainty.sweep.runner import find_study_objection
+from diffabs.uncertainty.sweep.seal import SweepError
 from diffabs.uncertainty.sweep.store import MANIFEST_NAME
 from diffabs.uncertainty.sweep.study import Study
 
@@ -24,7 +25,17 @@ def choose_study_engine(
 
     A study that names its engine is returned as it is. "auto" becomes the engine that the manifest in the folder
     records, if the sweep is resumed. Otherwise it becomes a kernel, if one can make the runs.
+
+    Raises:
+        SweepError: The engine is "kernel", and no kernel can make the runs.
     """
+    study, why = _resolve_auto(study, folder, resume, remote)
+    if study.engine == "kernel" and (objection := find_study_objection(study)):
+        raise SweepError(objection)
+    return study, why
+
+
+def _resolve_auto(study: Study, folder: str | pathlib.Path, resume: bool, remote: bool) -> tuple[Study, str]:
     if study.engine != "auto":
         return study, ""
     if resume and (pathlib.Path(folder) / MANIFEST_NAME).exists():
