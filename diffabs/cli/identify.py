@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from diffabs.cli import certificates, console, identify_options, progress, show, targets
-from diffabs.core.types import JsonObject
 from diffabs.scenario import section_tune
 from diffabs.scenario.measurements import Readings, read_separator
 from diffabs.scenario.model import result_document
@@ -61,6 +60,8 @@ def identify(
     Each value has a standard deviation. Parameters that the run does not determine are named."""
     with console.end_on_errors(), certificates.report_design_errors():
         console.need_extra("tune")
+        from diffabs.tune.identify.noise import describe_residuals
+
         targets.check_scenario_file(out)
         with targets.new_target_file(out, "--out") as file:
             setup = console.load_scenario(scenario, changes)
@@ -70,7 +71,9 @@ def identify(
             noise = identify_options.read_noise(sigma or (), readings, units)
             ranges = identify_options.read_ranges(free, setup)
             fit, noise, interrupted = _fit_with_progress(setup, readings, ranges, noise)
-            result = {**_result(setup, readings, ranges, fit, noise), "interrupted": interrupted}
+            residuals = describe_residuals(fit, noise, units)
+            values = {"data": readings.record(), **fit.record(setup.loop, ranges), "residuals": residuals}
+            result = {**result_document("identify", setup, values, "optax", "scipy"), "interrupted": interrupted}
             show_result = functools.partial(show.show_result, as_json, show.show_identification, result)
             if interrupted:
                 show_result()
@@ -112,19 +115,3 @@ def _fit_with_progress(
         ending,
     )  # fmt: skip
     return fit, noise, ending.is_requested
-
-
-def _result(
-    scenario: Scenario,
-    readings: Readings,
-    ranges: Mapping[str, section_tune.Ends | None],
-    fit: "Identified",
-    noise: Mapping[str, float],
-) -> JsonObject:
-    """Return the JSON document."""
-    from diffabs.tune.identify.noise import describe_residuals
-
-    residuals = describe_residuals(fit, noise, scenario.loop.plant.shows.units)
-    data = {"samples": len(readings.t), "columns": list(readings.columns), "until": float(readings.t[-1])}
-    values = {"data": data, **fit.record(scenario.loop, ranges), "residuals": residuals}
-    return result_document("identify", scenario, values, "optax", "scipy")

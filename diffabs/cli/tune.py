@@ -13,10 +13,11 @@ import typer
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.cli import engine as engines
 from diffabs.core.types import JsonObject
+from diffabs.scenario import tuning
 from diffabs.scenario.model import result_document
 from diffabs.scenario.proving import Proved, certify_result, without_certificate
 from diffabs.scenario.scenario import Scenario, dump
-from diffabs.scenario.tuning import Work, build_tuning, build_work, describe_tuning, format_shortfall, with_unproved
+from diffabs.scenario.tuning import Work
 
 if TYPE_CHECKING:
     from diffabs.tune import Tuned, TuningProgress
@@ -45,15 +46,14 @@ def tune(
         with targets.new_target_file(plot, "--plot") as picture:
             with targets.new_target_file(out, "--out") as out_file:
                 setup = console.load_scenario(scenario, console.add_option_overrides(changes, "tune", starts=starts))
-                work = console.run_with_progress(lambda: build_work(setup), "computing the runs")
+                work = console.run_with_progress(lambda: tuning.build_work(setup), "computing the runs")
                 tuned, result, sentence = _tune_and_document(work, engine)
                 show_result = functools.partial(_show, result, sentence, setup, as_json)
                 if not result["met"]:  # inside `with`: the exception discards the files
                     show_result()
                     _leave_if_interrupted(result)
-                    console.fail(
-                        f"{setup.name}: not met: {_unmet_constraints(result)}; {result['reason']}", console.FAILED
-                    )
+                    unmet = tuning.describe_unmet(result["constraints"])
+                    console.fail(f"{setup.name}: not met: {unmet}; {result['reason']}", console.FAILED)
                 if out_file:
                     with console.show_before_errors(show_result):
                         out_file.write_text(dump(setup.with_loop(tuned.loop, "tuned")), encoding="utf-8")
@@ -70,13 +70,10 @@ def tune(
 def _leave_if_interrupted(result: JsonObject) -> None:
     """Raise typer.Exit after Ctrl-C: the result shown is the best so far."""
     if result["interrupted"]:
-        met = "" if result["met"] else f"; not met: {_unmet_constraints(result)}, so that no file is written"
-        console.say(f"interrupted: this is the best so far, not a minimum{met}")
+        unmet = tuning.describe_unmet(result["constraints"])
+        line = "interrupted: this is the best so far, not a minimum"
+        console.say(f"{line}; not met: {unmet}, so that no file is written" if unmet else line)
         raise typer.Exit(console.INTERRUPTED)
-
-
-def _unmet_constraints(result: JsonObject) -> str:
-    return ", ".join(f"{row['name']} {format_shortfall(row)}" for row in result["constraints"] if not row["met"])
 
 
 def _show(result: JsonObject, sentence: str, scenario: Scenario, as_json: bool) -> None:
@@ -96,13 +93,13 @@ def _tune_and_document(work: Work, engine: str) -> tuple["Tuned", JsonObject, st
         result = console.run_with_progress(lambda: _document(work, tuned, proved), "comparing before and after")
     except KeyboardInterrupt:
         interrupted, proved = True, without_certificate("interrupted")
-        result = with_unproved(work, _document(work._replace(task=None), tuned, proved))
+        result = tuning.with_unproved(work, _document(work._replace(task=None), tuned, proved))
     return tuned, {**result, "interrupted": interrupted}, proved.sentence
 
 
 def _document(work: Work, tuned: "Tuned", proved: Proved) -> JsonObject:
     packages = ("optax", "scipy", *(("cvxpy", "clarabel") if proved.certified else ()))
-    return result_document("tune", work.scenario, describe_tuning(work, tuned, proved), *packages)
+    return result_document("tune", work.scenario, tuning.describe_tuning(work, tuned, proved), *packages)
 
 
 def _draw_unless_interrupted(work: Work, tuned: "Tuned", picture: pathlib.Path, interrupted: bool) -> JsonObject:
@@ -118,14 +115,12 @@ def _draw_unless_interrupted(work: Work, tuned: "Tuned", picture: pathlib.Path, 
 def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
     """Return the tuning, and True if Ctrl-C ended it. Raises typer.Exit if no start can be used."""
     from diffabs import tune
-    from diffabs.tune import Method, StartError, Stopping
 
-    goal, history = work.scenario.tune, list["TuningProgress"]()
+    history = list["TuningProgress"]()
     ending = console.InterruptibleEnd("the evaluation in hand", nothing=lambda: not history)
-    method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
-    max_iterations = None if work.constraints else goal.iterations  # with constraints the number of rounds is unknown
-
-    problem = build_tuning(work, engine)
+    # With constraints the number of rounds is unknown.
+    max_iterations = None if work.constraints else work.scenario.tune.iterations
+    problem, method = tuning.build_tuning(work, engine), tuning.build_method(work)
     engines.choose_engine(problem.find_engine)
 
     def run_tuning() -> "Tuned":
@@ -135,7 +130,7 @@ def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
         return console.run_with_progress(
             run_tuning, f"tuning {work.scenario.name}", lambda: _format_progress(history, max_iterations), ending
         ), ending.is_requested
-    except StartError as error:
+    except tune.StartError as error:
         console.fail(f"{work.scenario.name}: no start can be used: {error}", console.FAILED)
 
 

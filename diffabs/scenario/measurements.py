@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.types import JsonObject
 from diffabs.host import files, separated
 from diffabs.host.values import ScenarioError, format_given, unknown_name_error
 from diffabs.loop.closed_loop import LOOP_SIGNALS
@@ -46,6 +47,10 @@ class Readings(NamedTuple):
             if name not in self.columns:
                 raise unknown_name_error(f"{where} {format_given(name)} is not in the data", name, self.columns)
         return Readings(self.t, {name: self.columns[name] for name in names or self.columns})
+
+    def record(self) -> JsonObject:
+        """Return the number of instants, the last one [s] and the names of the columns as JSON values."""
+        return {"samples": len(self.t), "columns": list(self.columns), "until": float(self.t[-1])}
 
 
 def read_separator(text: str | None, where: str) -> str | None:

@@ -1,7 +1,7 @@
 """The task of a tuning, and the JSON values of its result."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
     from diffabs.robust.design.loop_task import ProofTask
-    from diffabs.tune import Batch, Tuned
+    from diffabs.tune import Batch, Method, Tuned
     from diffabs.tune.problem import Problem
 
 WHEN = ("before", "after")
@@ -73,6 +73,14 @@ def build_tuning(work: Work, engine: str = "auto") -> "Problem":
         constraints=list(work.constraints.values()),
         engine=engine,
     )
+
+
+def build_method(work: Work) -> "Method":
+    """Return the starts and the end of a tuning, for `tune.tune`."""
+    from diffabs.tune import Method, Stopping
+
+    goal = work.scenario.tune
+    return Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
 
 
 def describe_tuning(work: Work, tuned: "Tuned", proved: Proved) -> JsonObject:
@@ -174,6 +182,11 @@ def format_shortfall(row: JsonObject) -> str:
         return "not known"
     part = f" ({100 * row['missed'] / abs(row['bound']):.2g} %)" if row["bound"] else ""
     return f"by {row['missed']:.3g}{part}"
+
+
+def describe_unmet(rows: Sequence[JsonObject]) -> str:
+    """Return which constraints are not met, and by how much."""
+    return ", ".join(f"{row['name']} {format_shortfall(row)}" for row in rows if not row["met"])
 
 
 def numbers_at_bounds(free: Params) -> Iterator[str]:

@@ -402,7 +402,7 @@ def test_what_the_packaged_cure_says_is_met_is_met(tmp_path, changes):
     assert (-poles.real / np.abs(poles)).min() >= after.tune.damping
 
 
-@killed_by("cli.tune", "    except StartError as error:", "    except KeyError as error:")
+@killed_by("cli.tune", "    except tune.StartError as error:", "    except KeyError as error:")
 def test_no_start_that_can_be_used_could_not_be_done(small, monkeypatch):
     def none(*_, **__):
         raise StartError(f"{Reason.START.value}: 2 of 2 lanes diverge there")

@@ -109,3 +109,8 @@ def test_options_that_fit_no_file(file, csv, options, line):
     result = run("identify", file(SMALL), "--data", path, "--free", "plant.mass", *options, status=2)
     assert_one_error_line(result)
     assert line in result.stderr
+
+
+def test_readings_have_a_record(csv):
+    readings = read_measurements(csv("t [s],slip [1],speed [m/s]\n0,0,13.5\n0.25,0.125,12\n1.5,1e-3,0.5\n"), UNITS)
+    assert readings.select(["slip"]).record() == {"samples": 3, "columns": ["slip"], "until": 1.5}
