@@ -48,7 +48,6 @@ def examine_margins(
     """Return the margins of a scenario's loop, at its values and over the ranges of [design.over].
 
     Args:
-        scenario: Loop and ranges.
         values: Values by path of the loop, in SI, which replace the loop's own and their ranges.
         target: Setpoint, as in `linear.open_loop`.
         samples: Number of systems inside the ranges, added to the corners.

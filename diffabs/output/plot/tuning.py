@@ -93,10 +93,6 @@ def pareto_front(x: Scalar, y: Scalar) -> np.ndarray:
 
     A point is left out if another point is at least as small in both objectives. Of equal points one is kept. Points
     that are not finite are left out.
-
-    Args:
-        x: First objective, shape (n,).
-        y: Second objective, shape (n,).
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     # In the order of x (of equal x the smallest y first), a point is on the front if its y is a new minimum.

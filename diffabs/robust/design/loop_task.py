@@ -149,15 +149,13 @@ def speeds_of_box(box: Mapping[str, tuple[float, float]], speed: float) -> np.nd
 def greatest_decelerations(
     plant: Plant, over: Mapping[str, tuple[float, float]], speeds: Sequence[float] | np.ndarray
 ) -> np.ndarray:
-    """Return an upper bound of a brake's deceleration [m/s^2] at each speed, over all slips from 0 to 1.
+    """Return an upper bound of a brake's deceleration [m/s^2] at each speed [m/s], over all slips from 0 to 1.
 
     The greatest value at 2,001 slips and at the corners of the box, times 1.01, allows for a greater one between two
     slips.
 
     Args:
-        plant: Braking wheel or vehicle.
         over: Ranges (low, high) by path. Ranges of parameters of the plant count, `plant.mass` for example.
-        speeds: Speeds [m/s].
 
     Examples:
         >>> import diffabs as d

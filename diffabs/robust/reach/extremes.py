@@ -46,8 +46,6 @@ def find_extreme_runs(loop: Loop, solver: Solver, over: Mapping[str, tuple[float
     its metrics extrapolate to rest.
 
     Args:
-        loop: Closed loop.
-        solver: Steps and duration of the runs.
         over: Range (low, high) of each parameter of the box, by path, in SI units.
 
     Examples:

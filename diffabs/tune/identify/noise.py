@@ -38,7 +38,6 @@ def identify_with_noise(
     residuals, over three fits in all.
 
     Args:
-        loop: Loop whose parameters are identified.
         t: Instants [s] from the start of the run, shape (n,).
         columns: Measured values by the name of a field of the plant's output, shape (n,).
         free: Range of each free parameter by path; None for the declared range.
