@@ -4,6 +4,7 @@ Things have the names of things in the studies too."""
 
 import ast
 import collections
+import functools
 import pathlib
 import re
 
@@ -12,10 +13,8 @@ from mutants import killed_by
 from project import ROOT
 
 PACKAGE = ROOT / "diffabs"
-TREES = {path.relative_to(PACKAGE): ast.parse(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
-STUDIES = {
-    path.relative_to(ROOT): ast.parse(path.read_text("utf-8")) for path in sorted((ROOT / "experiments").rglob("*.py"))
-}
+FILES = {path.relative_to(PACKAGE): path for path in sorted(PACKAGE.rglob("*.py"))}
+STUDIES = {path.relative_to(ROOT): path for path in sorted((ROOT / "experiments").rglob("*.py"))}
 
 # The same verb, the same meaning: a command and the function that it calls; the methods of a paper's module; a
 # formula of a checker that imports nothing of the package.
@@ -38,10 +37,19 @@ FILLERS = {
 }
 
 
-def homes(kind, trees=TREES):
+@functools.cache  # and not at import: only one worker runs these tests
+def parse(file):
+    return ast.parse(file.read_text("utf-8"))
+
+
+def package_trees():
+    return {path: parse(file) for path, file in FILES.items()}
+
+
+def homes(kind, trees=None):
     """Return the files in which each public class or function is defined at the top of a module, by name."""
     found = collections.defaultdict(set)
-    for path, tree in trees.items():
+    for path, tree in (trees or package_trees()).items():
         for node in tree.body:
             if isinstance(node, kind) and not node.name.startswith("_"):
                 found[node.name].add(str(path))
@@ -55,7 +63,7 @@ def several(found):
 def constants():
     """Return the values of each constant at the top of a module, as written, by name and file."""
     found = collections.defaultdict(dict)
-    for path, tree in TREES.items():
+    for path, tree in package_trees().items():
         for node in tree.body:
             if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
                 targets = node.targets if isinstance(node, ast.Assign) else [node.target]
@@ -94,9 +102,9 @@ def test_a_constant_has_one_meaning():
 
 
 @killed_by("parts.stops.stops", "_rest_of_braking", "_braked")
-@pytest.mark.parametrize("path", TREES, ids=str)
+@pytest.mark.parametrize("path", FILES, ids=str)
 def test_no_function_is_named_by_a_participle(path):
-    names = {node.name.strip("_") for node in functions(TREES[path])}
+    names = {node.name.strip("_") for node in functions(parse(FILES[path]))}
     found = {name for name in names if re.fullmatch(r"[a-z]+(ed|ing)", name) or name in IRREGULAR}
     assert found - PARTICIPLES == set()
 
@@ -112,9 +120,9 @@ def things(tree):
 
 
 @killed_by("engine.step.slides", "    comparison: shapes", "    which: shapes")
-@pytest.mark.parametrize("path", TREES | STUDIES, ids=str)
+@pytest.mark.parametrize("path", FILES | STUDIES, ids=str)
 def test_a_thing_has_the_name_of_a_thing(path):
-    tree = (TREES | STUDIES)[path]
+    tree = parse((FILES | STUDIES)[path])
     assert [f"{name}, line {line}" for name, line in things(tree) if name.strip("_") in FILLERS] == []
 
 
