@@ -30,7 +30,7 @@ def test_levels_so_far_have_the_product_of_their_shares() -> None:
 @killed_by("uncertainty.sweep.run", 'f"{words}, {self.refused:,} refused" if self.refused else', "")
 def test_a_sweep_says_how_far_it_is() -> None:
     at = SweepProgress(2000, 4000, 1000, 2.0, 3, 1, tuple(range(10)), 5)
-    assert at.describe_count() == "2,000 of 4,000: 500/s, 3 failed, 1 of them diverged, 5 refused"
+    assert at.describe_count() == "2,000 of 4,000: 500/s, 3 failed (1 diverged), 5 refused"
     assert at._replace(here=0).describe_count() == "2,000 of 4,000, compiling"
     assert at._replace(samples=4000, here=0).describe_count() == "4,000 of 4,000"
     assert at.describe_damage() == "damaged, computed again: chunks 0, 1, 2, 3, 4, 5, 6, 7 and 2 more"

@@ -56,7 +56,7 @@ class SweepProgress(NamedTuple):
         words = f"{self.samples:,} of {self.total:,}"
         if not self.here:
             return f"{words}, compiling" if self.samples < self.total else words
-        words += f": {self.rate:,.0f}/s, {self.failed:,} failed, {self.diverged:,} of them diverged"
+        words += f": {self.rate:,.0f}/s, {self.failed:,} failed ({self.diverged:,} diverged)"
         return f"{words}, {self.refused:,} refused" if self.refused else words
 
     def describe_damage(self) -> str:
