@@ -12,7 +12,6 @@ from diffabs import __version__
 from diffabs.cli import console, targets
 from diffabs.engine.solvers import FixedStep
 from diffabs.host.values import ScenarioError
-from diffabs.parts.controllers import Sampled, SampledOnGrid
 from diffabs.scenario.scenario import Scenario
 
 
@@ -86,12 +85,10 @@ def export(
 def _sample_controller(scenario: Scenario, period: float) -> Scenario:
     from diffabs.output.export import sample_controller
 
-    if isinstance(scenario.loop.controller, Sampled | SampledOnGrid):
-        raise ScenarioError("--period: the scenario's controller is sampled; change it with --set controller.period=")
     try:
         return dataclasses.replace(scenario, loop=sample_controller(scenario.loop, period))
     except ValueError as error:
-        raise ScenarioError(str(error)) from None
+        raise ScenarioError(f"--period: {error}") from None
 
 
 def _function_prefix(scenario: Scenario, out: pathlib.Path | None) -> str:

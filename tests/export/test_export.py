@@ -481,7 +481,7 @@ def test_the_command_writes_a_file_that_compiles(tmp_path):
         (["slip-estimator", "--set", 'controller={type="sampled"}'], "controller.controller is missing"),
         (["slip-lmi", "--period", "0"], "controller.period = 0 is outside (0, inf) s"),
         (["slip-estimator", "--period", "0.1"], "controller.cutoff = 55 rad/s is outside (0, 20) rad/s"),
-        (["slip-cured", "--period", "1e-3"], "--period: the scenario's controller is sampled"),
+        (["slip-cured", "--period", "1e-3"], "--period: the controller is sampled; it has a period of its own"),
         (["slip-lmi", "--to", "st"], "controller StateFeedback runs in continuous time"),
         (["slip-lmi", "--to", "fmu", "--float32"], "are for --to c and --to st"),
         (["slip-cured", "--to", "table"], "table"),
