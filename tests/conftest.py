@@ -49,8 +49,8 @@ jax.config.update("jax_enable_x64", True)
 DEAREST = """
 conformance kernel sweep deferred tune export sealed riccati proofs roads sweep_statistics blocks certificate linearize
 real_rig batch kinks margins delay cli_tune rollout cli refusals papers sweep_kill kernel_start explore cli_design
-kernel_tangents frames adaptive gradients arm_basin servo
-"""  # the last ones for what is slow in them
+kernel_tangents frames adaptive gradients arm_basin servo followed_slides tuning
+"""  # the last ones for what is slow in them, or because they would end the run
 
 
 def pytest_make_parametrize_id(config: pytest.Config, val: object, argname: str) -> str | None:

@@ -102,9 +102,11 @@ def test_a_program_is_the_function(name):
     f, count = KINKED[name]
     one = program(f)
     assert sum(int(np.prod(shape)) for _, shape in one.places) == count
+    free = held(one, 0.1)._replace(free=True)
     for x in POINTS:
-        for regime in (Mode(None), held(one, x), held(one, 0.1)._replace(free=True)):
-            np.testing.assert_array_equal(one(same, x, 0.6, regime), f(jnp.asarray(x), jnp.asarray(0.6)))
+        value = f(jnp.asarray(x), jnp.asarray(0.6))
+        for regime in (Mode(None), held(one, x), free):
+            np.testing.assert_array_equal(one(same, x, 0.6, regime), value)
 
 
 @pytest.mark.parametrize(

@@ -556,6 +556,7 @@ def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, words):
         ("model", None, "model = None is nothing; a table is needed"),
         ("model.parameters", "x", 'model.parameters = "x" is text; a table is needed'),
         ("neglected", 3, "a value in it is of the wrong type"),
+        ("over", {"plant.mass": [5.3]}, "ValueError not enough values to unpack (expected 2, got 1)"),
     ],
 )
 def test_a_member_of_another_type_is_one_line(results, tmp_path, path, value, words):
