@@ -230,9 +230,10 @@ def switches(
     comparisons = []
     for (first, shape), op in zip(program.places, program.origins, strict=True):
         bits = range(first, first + int(np.prod(shape)))
-        margins = [surface.value for surface in surfaces if int(np.min(surface.numbers)) in bits]
-        margin = margins[0] if len(margins) == 1 else min(margins, key=abs)
-        turned = op.queries[0][1] and op.name != SEARCHSORTED  # the distance to a knot has no side
+        margins = surfaces.values[np.isin(surfaces.numbers, bits)]
+        searches = op.name == SEARCHSORTED  # its margins are the distances to the knots below and above
+        margin = margins[jnp.argmin(jnp.abs(margins))] if searches else margins.reshape(shape)
+        turned = op.queries[0][1] and not searches  # the distance to a knot has no side
         times = tuple(time for time, bit in flips if bit in bits)
         comparisons.append(Switch(summarize(op.source), op.name, -margin if turned else margin, times))
     return comparisons

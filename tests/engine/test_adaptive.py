@@ -445,17 +445,22 @@ def test_steps_that_find_themselves_are_never_unstable():
     d.check(loop, d.Adaptive(1e-5, 4.0, 1e-2))
 
 
-@killed_by("engine.step.surfaces", "next = jnp.where((since < -nearest) & (since > next), since, next)", "del nearest")
-@pytest.mark.slow
+@killed_by(
+    "engine.step.surfaces", "jnp.where(since < -nearest, -since, NEVER_S)", "jnp.where(since < 0, -since, NEVER_S)"
+)
+@killed_by("engine.step.surfaces", "inside = later & (since >", "inside = (since >")
 def test_lines_say_when_comparisons_change_and_when_they_did():
-    numbers = [0, 1, 33, np.array([2, 3])]
-    values = [jnp.asarray(3.0), jnp.asarray(-2.0), jnp.asarray(1.0), jnp.array([0.5, 4.0])]
-    rates = [jnp.asarray(-1.0), jnp.asarray(1.0), jnp.asarray(4.0), jnp.array([1.0, -40.0])]
-    margins = [surfaces.SwitchingFunction(*one) for one in zip(numbers, values, rates, strict=True)]
+    numbers = np.array([0, 1, 33, 2, 3])
+    values, rates = jnp.array([3.0, -2.0, 1.0, 0.5, 4.0]), jnp.array([-1.0, 1.0, 4.0, 1.0, -40.0])
+    margins = surfaces.SwitchingFunctions(numbers, values, rates)
     words = (jnp.uint32(0b1100), jnp.uint32(0b10))
     np.testing.assert_array_equal(surfaces.read_bits(words, np.array([2, 3, 33, 1])), [True, True, True, False])
     length = jnp.asarray(1.0)
-    assert surfaces.forecast_crossing(margins, length, 0.0) == pytest.approx(0.1)  # 4 falls by 40/s
+    assert surfaces.forecast_crossing(margins, length, 0.0) == pytest.approx(0.1)  # 3 falls by 40/s
+    assert surfaces.forecast_crossing(margins, length, 0.2) == pytest.approx(
+        2.0
+    )  # 0.1 s counts as past, 1 rises by 1/s
+    assert surfaces.find_imminent(margins, length).number == 3
     # Bits 2 and 33 changed 0.5 s and 0.25 s ago.
     assert surfaces.time_since_crossing(margins, words, length) == pytest.approx(0.5)
     assert surfaces.time_since_crossing(margins, (jnp.uint32(0),) * 2, length) == 0

@@ -64,6 +64,7 @@ from diffabs.engine.step.step_size import (
     spectral_step_limit,
 )
 from diffabs.engine.step.surfaces import (
+    NO_SURFACES,
     find_imminent,
     find_return,
     forecast_crossing,
@@ -217,11 +218,12 @@ class AdaptiveStepping:
         point, zero, no = carry.point, carry.k, carry.unrestricted
         state = borrow(point.state, None)
         scale = error_scales(state, point.sample)
-        limit = self._find_stability_limit(hybrid, point.t, state, scale) if self.stable else self.h * self.steps
+        limit = self.h * self.steps  # until the first renewal, before the first step
         to_strike = self._next_strike(hybrid, zero) * self.h
-        length, strikes = plan_step(jnp.minimum(error_limited, limit), self._ahead(point), to_strike)
+        length, strikes = plan_step(error_limited, self._ahead(point), to_strike)
         last = span_step(point, point) if self.keeps_last_step else ()
-        control = AdaptiveControl(error_limited, limit, scale, zero, zero, last, zero, 1.0 + 0.0 * self.h, no, zero)
+        due = zero - ATTEMPTS_PER_RENEWAL
+        control = AdaptiveControl(error_limited, limit, scale, zero, due, last, zero, 1.0 + 0.0 * self.h, no, zero)
         return cast_floats(carry._replace(length=length, base=length, strikes=strikes, control=control), self.h.dtype)
 
     def renew(self, hybrid: HybridSystem, carry: Carry) -> Carry:
@@ -433,7 +435,7 @@ class AdaptiveStepping:
 
     def _select_watched(self, dynamics: Evaluation) -> Evaluation:
         """Return the dynamics with those margins only whose turns are looked for: of events, or all if it `watches`."""
-        return dynamics if self.watches else dynamics._replace(surfaces=[])
+        return dynamics if self.watches else dynamics._replace(surfaces=NO_SURFACES)
 
     def _next_strike(self, hybrid: HybridSystem, k: Int) -> Int:
         """Return the number of the first grid instant after the `k`-th at which a clock strikes or the run ends."""

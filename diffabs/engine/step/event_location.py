@@ -154,8 +154,9 @@ def _find_event_crossings(number: Array, first: int, before: list[PyTree], after
 
 def find_surface_crossing(dynamics: Evaluation, number: Array, like: Scalar) -> SurfaceCrossing:
     """Return the comparisons whose answers at the end of a step contradict its mode; `like` has the margin's type."""
-    margins = [(surface.numbers, surface.value) for surface in dynamics.surfaces]
-    return find_contradicted(ComparisonAnswers(dynamics.words, dynamics.contradicted, margins), number, like)
+    surfaces = dynamics.surfaces
+    answers = ComparisonAnswers(dynamics.words, dynamics.contradicted, surfaces.numbers, surfaces.values)
+    return find_contradicted(answers, number, like)
 
 
 def find_crossings(

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.types import Array, Bool, PyTree, Scalar, Vector
+from diffabs.core.types import AnyArray, Array, Bool, Int, PyTree, Scalar, Vector
 
-WORD_BITS = 32  # answers in a word
+WORD_BITS, WORD_SHIFT = 32, 5  # answers in a word, and the logarithm of base 2 of this number
 NO_BIT = -2  # number of no comparison; -1 is the number of a comparison that was not found
 ROUNDING_POWER = 0.75  # eps to this power is a relative difference that may come from rounding alone
 
@@ -64,18 +64,28 @@ class ComparisonAnswers(NamedTuple):
     Attributes:
         words: Answers that were used.
         contradicted: Answers that the numbers contradict by more than rounding, and that did not give way.
-        margins: Pairs (numbers of the bits, margins): one for each comparison, two for a search in knots. A margin is
-            negative where the numbers contradict the answer. Without frozen answers it is x - y, with either sign.
+        numbers: Numbers of the bits to which the margins belong, shape (n,): one for each comparison, two for a search
+            in knots.
+        margins: Margins, shape (n,). A margin is negative where the numbers contradict the answer. Without frozen
+            answers it is x - y, with either sign.
     """
 
     words: ModeBits
     contradicted: ModeBits
-    margins: list[tuple[PyTree, PyTree]]
+    numbers: AnyArray
+    margins: Array
+
+
+def split_number(number: Array) -> tuple[Array, Array]:
+    """Return the word and the place in it of the bit with this number; a word that does not exist for -1 and -2."""
+    # Shift and mask are two operations; // and % of numbers with a sign are twenty each.
+    bits = number.astype(jnp.uint32)
+    return bits >> WORD_SHIFT, bits & (WORD_BITS - 1)
 
 
 def single_bit(number: Array, words: int) -> ModeBits:
     """Return packed words with one bit set, or without a set bit if its `number` is negative."""
-    word, place = number // WORD_BITS, (number % WORD_BITS).astype(jnp.uint32)
+    word, place = split_number(number)
     return tuple(jnp.where(word == i, jnp.uint32(1) << place, jnp.uint32(0)) for i in range(words))
 
 
@@ -106,13 +116,14 @@ def find_contradicted(answers: ComparisonAnswers, number: Array, like: PyTree) -
         lowest = jax.lax.population_count((remaining & (~remaining + 1)) - 1)
         unsought = jnp.where(remaining != 0, i * WORD_BITS + lowest.astype(number.dtype), unsought)
         crossed |= (word & bit) != 0
-    target, margin = jnp.where(crossed | (unsought < 0), number, unsought), jnp.zeros_like(like)
-    for numbers, values in answers.margins:
-        inside = target == numbers
-        if jnp.ndim(values):
-            inside, values = jnp.any(inside), jnp.sum(jnp.where(inside, values, 0.0))
-        margin = jnp.where(inside, values, margin)
+    target = jnp.where(crossed | (unsought < 0), number, unsought)
+    margin = pick_number(answers.numbers, target, answers.margins).astype(like.dtype)
     return SurfaceCrossing(unsought, crossed, target, margin)
+
+
+def pick_number(numbers: AnyArray, number: Int, values: Array) -> Array:
+    """Return the value with this number, of `values` (n,) with the `numbers` (n,); 0 without one."""
+    return jnp.sum(jnp.where(numbers == number, values, 0.0))
 
 
 class ComparisonTrace:
@@ -225,12 +236,26 @@ class ComparisonTrace:
         """Return the answers, the contradicted bits and the margins."""
         against = self.against
         if self.mode.words is None:
-            return ComparisonAnswers(tuple(self.said), tuple(against), self.margins)
+            return ComparisonAnswers(tuple(self.said), tuple(against), *self._stack_margins())
         loose = self.mode.released or (np.uint32(0),) * len(against)
         words = (was ^ (now & give) for was, now, give in zip(self.mode.words, against, loose, strict=True))
         return ComparisonAnswers(
-            tuple(words), tuple(now & ~give for now, give in zip(against, loose, strict=True)), self.margins
+            tuple(words), tuple(now & ~give for now, give in zip(against, loose, strict=True)), *self._stack_margins()
         )
+
+    def _stack_margins(self) -> tuple[AnyArray, Array]:
+        """Return the numbers and the margins of all comparisons."""
+        numbers = [number for number, _ in self.margins]
+        known = all(isinstance(number, int | np.ndarray) for number in numbers)
+        if not numbers:
+            return np.zeros(0, int), jnp.zeros(0)
+        stacked = np.concatenate([np.ravel(x) for x in numbers]) if known else stack_flat(numbers)
+        return stacked, stack_flat([margin for _, margin in self.margins])
+
+
+def stack_flat(arrays: Sequence[object]) -> Array:
+    """Return all numbers of the arrays in one vector; in few operations, since a program has one for each."""
+    return jnp.concatenate([jnp.ravel(jnp.asarray(x)) for x in arrays])
 
 
 def _ones(count: Array) -> Array:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.core.cubic import Cubic, HermiteStep
 from diffabs.core.lanes import any_lane
@@ -15,6 +16,7 @@ from diffabs.core.types import Array, Bool, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState
 from diffabs.engine.step.advance import Carry
 from diffabs.engine.step.attempt import mode_in_step
+from diffabs.engine.step.modes import stack_flat
 from diffabs.engine.step.slides import along_of
 from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.system import Evaluation, ObservedSystem
@@ -140,9 +142,8 @@ def _outlook(carry: PyTree) -> Outlook:
 
 def _list_margins(dynamics: Evaluation, bit_count: int) -> tuple[Array, Array, Array]:
     """Return margins, rates and numbers of the comparisons and then of the events, each of shape (n,)."""
-    surfaces = [(surface.value, surface.rate, surface.numbers) for surface in dynamics.surfaces]
-    values, rates = (jax.tree.leaves(tree) for tree in (dynamics.margins, dynamics.margin_rates))
-    events = [(*pair, bit_count + i) for i, pair in enumerate(zip(values, rates, strict=True))]
-    columns = zip(*surfaces, *events, strict=True)
-    margins, rates, numbers = (jnp.concatenate([jnp.ravel(jnp.asarray(x)) for x in column]) for column in columns)
-    return margins, rates, numbers
+    surfaces, events = dynamics.surfaces, jax.tree.leaves(dynamics.margins)
+    assert surfaces.rates is not None
+    margins = stack_flat([surfaces.values, *events])
+    rates = stack_flat([surfaces.rates, *jax.tree.leaves(dynamics.margin_rates)])
+    return margins, rates, stack_flat([surfaces.numbers, bit_count + np.arange(len(events))])

@@ -29,7 +29,7 @@ from diffabs.engine.solvers import ADAPTIVE_ERROR_ORDER, Adaptive
 from diffabs.engine.step.adaptive import AdaptiveStepping, StateSpan, clip_rtol, span_step
 from diffabs.engine.step.advance import Carry, Decision, advance, cast_floats, start_carry
 from diffabs.engine.step.attempt import Attempt, StepRequest, mode_in_step
-from diffabs.engine.step.modes import ModeBits, SlidingSurface
+from diffabs.engine.step.modes import ModeBits, SlidingSurface, pick_number
 from diffabs.engine.step.runge_kutta import TSIT5
 from diffabs.engine.step.slides import along_of, is_return
 from diffabs.engine.step.status import RunStatus
@@ -304,12 +304,11 @@ def _time_to_event(entry: StepLog, strikes: Bool, end: Evaluation) -> Scalar:
     It is also 0 for a comparison if a clock determines the end; an event there keeps its time.
     """
     shift, longest = jnp.zeros_like(entry.length), MAX_SHIFT_FRACTION * entry.base
-    for surface in end.surfaces:
-        on = surface.numbers == entry.lands
-        each = (jnp.ravel(jnp.asarray(x)) for x in (on, surface.value, surface.rate))
-        for lands, margin, rate in zip(*each, strict=True):
-            close, later = _time_to_zero(lands, margin, rate, longest)
-            shift = jnp.where(close, later, shift)
+    surfaces = end.surfaces
+    assert surfaces.rates is not None
+    margin, rate = (pick_number(surfaces.numbers, entry.lands, x) for x in (surfaces.values, surfaces.rates))
+    close, later = _time_to_zero(entry.lands >= 0, margin, rate, longest)
+    shift = jnp.where(close, later, shift)
     # A clock fixes the time of a crossing, but events come last: an event decides even at a clock's instant.
     shift = jnp.where(strikes, 0.0, shift)
     events = zip(jax.tree.leaves(end.margins), jax.tree.leaves(end.margin_rates), strict=True)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import ratio
 from diffabs.core.types import AnyArray, Array, PyTree, Scalar
-from diffabs.engine.step.modes import ComparisonAnswers, Mode, ModeBits, SlidingSurface, single_bit
+from diffabs.engine.step.modes import ComparisonAnswers, Mode, ModeBits, SlidingSurface, pick_number, single_bit
 from diffabs.engine.step.surfaces import read_bits
 
 MAX_SURFACES = 2  # along which a run can slide at the same time
@@ -97,7 +97,7 @@ def _look_at_sides(look: Look, t: Scalar, z: PyTree, mode: Mode) -> _Sides:
 
     def list_margins(t: Scalar, z: PyTree) -> list[Scalar]:
         at = look(t, z, Mode(answers.words))[1]
-        return [_pick_margin(at, surface.number) for surface in mode.along]
+        return [pick_number(at.numbers, surface.number, at.margins) for surface in mode.along]
 
     margins, move = jax.linearize(list_margins, t, z)
     pushes = jax.vmap(lambda rates: move(jnp.ones_like(t), rates))(dynamics[:2])
@@ -118,11 +118,6 @@ def stack_surfaces(along: tuple[SlidingSurface, ...]) -> SlidingSurface:
     return jax.tree.map(lambda *x: jnp.stack(x), *along)
 
 
-def _pick_margin(answers: ComparisonAnswers, number: Array) -> Scalar:
-    """Return the margin of the comparison with this bit; 0 for -1."""
-    return sum(jnp.sum(jnp.where(numbers == number, margin, 0.0)) for numbers, margin in answers.margins)
-
-
 def _balance(pushes: list[Array], along: tuple[SlidingSurface, ...], excesses: list[Scalar]) -> tuple[Scalar, ...]:
     """Return x_i with excess_k + sum_i x_i (push_k of side i - push_k) = 0 for each margin k; 0 without a surface."""
     rows = [
@@ -141,13 +136,11 @@ def _answer_by_shares(answers: ComparisonAnswers, mode: Mode, shares: tuple[Scal
     """Return the answers whose margins along the surfaces are those of the shares."""
     undecided = sliding_answers(mode.along)
     contradicted = tuple(word & ~bits for word, bits in zip(answers.contradicted, undecided, strict=True))
-    margins = [
-        (numbers, jnp.where(read_bits(undecided, numbers), jnp.inf, margin)) for numbers, margin in answers.margins
-    ]
+    margins = jnp.where(read_bits(undecided, answers.numbers), jnp.inf, answers.margins)
     for surface, share in zip(mode.along, shares, strict=True):
         ahead, bits = share * (1.0 - share), single_bit(surface.number, len(contradicted))
-        margins = [(numbers, jnp.where(numbers == surface.number, ahead, margin)) for numbers, margin in margins]
+        margins = jnp.where(answers.numbers == surface.number, ahead, margins)
         contradicted = tuple(
             jnp.where(ahead < 0, word | bit, word & ~bit) for word, bit in zip(contradicted, bits, strict=True)
         )
-    return ComparisonAnswers(answers.words, contradicted, margins)
+    return ComparisonAnswers(answers.words, contradicted, answers.numbers, margins)

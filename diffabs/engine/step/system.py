@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.core.lanes import any_lane
 from diffabs.core.protocols import Memory, Segment
@@ -19,7 +20,7 @@ from diffabs.engine.hybrid import HybridSignals, HybridState, HybridSystem, Marg
 from diffabs.engine.step.comparisons import SwitchedProgram
 from diffabs.engine.step.modes import ComparisonAnswers, Mode, ModeBits
 from diffabs.engine.step.sliding_flow import SlidingDynamics, return_to_surfaces, slide
-from diffabs.engine.step.surfaces import SwitchingFunction
+from diffabs.engine.step.surfaces import SwitchingFunctions
 
 Accumulators = dict[str, Memory]
 
@@ -53,7 +54,7 @@ class Evaluation(NamedTuple):
         margins: Margins of the stop and of the events.
         words: Answers to the comparisons.
         contradicted: Answers of the mode that the numbers contradict.
-        surfaces: Margins of the comparisons.
+        surfaces: Margins of the comparisons, and their rates.
         signal_rates: Rates of the sample, or of its shown part, or (), as the objectives need them.
         recorded_rates: Rates of the recorded signals, by name.
         margin_rates: Rates of the margins of stop and events; () if they were not evaluated.
@@ -65,7 +66,7 @@ class Evaluation(NamedTuple):
     margins: Margins
     words: ModeBits
     contradicted: ModeBits
-    surfaces: list[SwitchingFunction]
+    surfaces: SwitchingFunctions
     signal_rates: PyTree
     recorded_rates: dict[str, PyTree]
     margin_rates: PyTree
@@ -128,7 +129,7 @@ class ObservedSystem(NamedTuple):
         (margins, _), answers = self.program.look(
             lambda dynamics: (dynamics.margins, dynamics[:2]), moving, fixed, mode
         )
-        return [margin for _, margin in answers.margins] + jax.tree.leaves(margins)
+        return [answers.margins, *jax.tree.leaves(margins)]
 
     def evaluate(self, t: Scalar, state: HybridState, accumulators: Accumulators, mode: Mode) -> Evaluation:
         """Return the dynamics at time `t`, `state` and `accumulators` within a `mode`."""
@@ -137,7 +138,7 @@ class ObservedSystem(NamedTuple):
 
         def look(t: Scalar, z: PyTree, mode: Mode) -> tuple[Instant, ComparisonAnswers]:
             if self.program is None:
-                return _evaluate((t, *z), fixed), ComparisonAnswers((), (), [])
+                return _evaluate((t, *z), fixed), ComparisonAnswers((), (), np.zeros(0, int), jnp.zeros(0))
             return self.program.look(lambda dynamics: dynamics, (t, *z), fixed, mode)
 
         def look_aside(t: Scalar, z: PyTree) -> SlidingDynamics:
@@ -158,13 +159,11 @@ class ObservedSystem(NamedTuple):
             dynamics, answers, _ = look(t, z)
             sample = dynamics.signals.sample
             shown = {"sample": sample, "shown": sample.show(), "": ()}[self.signal_rates]
-            margins = (
-                (dynamics.margins, [margin for _, margin in answers.margins]) if self.has_margin_rates else ((), [])
-            )
+            margins = (dynamics.margins, answers.margins) if self.has_margin_rates else ((), ())
             return (shown, dynamics.signals.recorded, *margins), answers
 
         dynamics, answers, shares = look(t, z)
-        surfaces = [SwitchingFunction(*margin_pair) for margin_pair in answers.margins]
+        surfaces = SwitchingFunctions(answers.numbers, answers.margins)
         signal_rates, recorded_rates, margin_rates = (), dynamics.signals.recorded, ()
         if self.signal_rates or self.has_margin_rates or self.hybrid.recorders:
             # The derivative along (1, dz/dt) is the total time derivative on the trajectory.
@@ -172,8 +171,7 @@ class ObservedSystem(NamedTuple):
             (_, _, _, values), moves, answers = jax.jvp(moving_signals, (t, z), along, has_aux=True)
             signal_rates, recorded_rates, margin_rates, rates = moves
             if self.has_margin_rates:
-                each = zip(answers.margins, values, rates, strict=True)
-                surfaces = [SwitchingFunction(numbers, value, rate) for (numbers, _), value, rate in each]
+                surfaces = SwitchingFunctions(answers.numbers, values, rates)
         return Evaluation(
             *(dynamics[:2], dynamics.signals, dynamics.margins, answers.words, answers.contradicted, surfaces),
             *(signal_rates, recorded_rates, margin_rates, shares),
