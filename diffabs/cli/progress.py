@@ -119,9 +119,6 @@ def fit_line(words: str, short_words: str, times: str, width: int) -> str:
     """Return progress and times on one line of a terminal.
 
     If the line is too long, it loses the message first. The progress is then cut at its end, the times never.
-
-    Args:
-        short_words: Progress alone.
     """
     room = width - len(times)
     if len(words) > room:

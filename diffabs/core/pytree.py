@@ -100,8 +100,6 @@ def param(
     """Return the field of a parameter: one differentiable leaf, with the shape of its default.
 
     Args:
-        default: Default value.
-        unit: Unit of the value.
         low: Lower end of the range, which belongs to the range.
         high: Upper end of the range, which belongs to the range.
         above: Lower end of the range, which does not belong to the range.

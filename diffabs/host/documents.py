@@ -91,7 +91,6 @@ def read_document(path: str | os.PathLike[str], max_bytes: int = MAX_DOCUMENT_BY
 
     Args:
         path: File of at most `max_bytes` bytes.
-        max_bytes: Greatest size.
         exact: Whether every number is a finite double and every name in a table occurs once, as in certificates.
 
     Raises:

@@ -261,13 +261,10 @@ class RecordResiduals:
 
 
 def simulate_readings(run: Run, recorded: RecordedRun, solver: FixedStep, t: Vector) -> tuple[Vector, Vector]:
-    """Return the counter's wheel speed [rad/s] and the computer's slip [1] at instants of a run, shape (n,) each.
+    """Return the counter's wheel speed [rad/s] and the computer's slip [1] at instants t [s], all of shape (n,).
 
     The wheel speed is the true one, older by the counter's lag. The slip is that of the encoders. After the end of the
     run both are 0: the driver's dead zone hides slower speeds.
-
-    Args:
-        t: Instants [s], shape (n,).
     """
     assert run.trajectory is not None
     output, measured, running = run.trajectory.sample.output, run.trajectory.measured, run.trajectory.running

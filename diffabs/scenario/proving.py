@@ -52,7 +52,6 @@ def build_proof_task(
     """Return the linear systems of a scenario over [design.over], with the gain to certify.
 
     Args:
-        scenario: Scenario.
         read_gain: Function that returns the gain for the names of the states; by default the controller's gain.
         weighed: Also require the weights of a cost.
 
@@ -138,7 +137,6 @@ def describe_proof(
     """Return the JSON values of a proof, whose parameters have the names of the linear model and SI units.
 
     Args:
-        task: Systems and gain.
         proof: Certificate; None if nothing was found.
         reason: Why the gain or a property is missing.
         further: Results without a common Lyapunov matrix.

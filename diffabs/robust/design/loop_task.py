@@ -97,7 +97,6 @@ def build_loop_task(
         over: Range (low, high) of each parameter of the linear model, by path, in SI units.
         spec: Specification of the closed loops; None stands for stability alone.
         gain: Gain of u = K x, one number per state; by default that of the controller.
-        reduced: The loop as `reduce_loop` returns it, where it is already known.
 
     Raises:
         ValueError: A loop without linear model, or ranges that the model or its speeds do not allow.
@@ -140,7 +139,6 @@ def speeds_of_box(box: Mapping[str, tuple[float, float]], speed: float) -> np.nd
     The ends suffice for friction and air drag: a = f + c v^2 and a/v are convex. Friction may depend on the speed.
 
     Args:
-        box: Ranges (low, high) by path.
         speed: Speed [m/s] of a box that has no range of it.
     """
     return np.linspace(*box.get("speed", (speed, speed)), SPEEDS)
