@@ -246,10 +246,10 @@ class ComparisonTrace:
     def _stack_margins(self) -> tuple[AnyArray, Array]:
         """Return the numbers and the margins of all comparisons."""
         numbers = [number for number, _ in self.margins]
-        known = all(isinstance(number, int | np.ndarray) for number in numbers)
+        constant = all(isinstance(number, int | np.ndarray) for number in numbers)
         if not numbers:
             return np.zeros(0, int), jnp.zeros(0)
-        stacked = np.concatenate([np.ravel(x) for x in numbers]) if known else stack_flat(numbers)
+        stacked = np.concatenate([np.ravel(x) for x in numbers]) if constant else stack_flat(numbers)
         return stacked, stack_flat([margin for _, margin in self.margins])
 
 
