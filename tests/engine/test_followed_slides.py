@@ -13,6 +13,8 @@ from mutants import killed_by
 import diffabs as d
 from diffabs.core.pytree import get, replace
 from diffabs.engine.solve import SolutionStatus
+from diffabs.engine.step import fixed, sliding_flow
+from diffabs.engine.step.modes import ComparisonAnswers, Mode, SlidingSurface
 from diffabs.loop.sliding import describe_slide
 from diffabs.parts.objectives import IAE
 
@@ -129,6 +131,81 @@ def test_random_fields_slide_along_two_surfaces():
     assert slides > 120
     assert both > 50
     assert refused <= 20
+
+
+def push_with_wave(t, y, p):
+    """Return the rates of a force that pushes to zero, with a square wave, and of the integral of state and wave."""
+    wave = jnp.sin(p * t) > 0
+    return -jnp.sign(y[0]) + jnp.where(wave, 0.3, -0.3), y[0] + wave
+
+
+def exact_wave_integral(p, end=2.0):
+    """Return the integral over `end` seconds from the state 1: it falls to zero in straight pieces, and stays."""
+    integral, state, begin = 0.0, 1.0, 0.0
+    for k in range(int(end * p / np.pi) + 1):
+        until, on = min((k + 1) * np.pi / p, end), k % 2 == 0
+        length, rate = until - begin, -0.7 if on else -1.3
+        falls = min(length, -state / rate)
+        integral += state * falls + rate * falls**2 / 2 + on * length
+        state, begin = max(0.0, state + rate * length), until
+    return integral
+
+
+@killed_by("engine.step.advance", "& (regular | decision.crosses_surface)", "& regular")
+@pytest.mark.parametrize("step", ["fixed", "adaptive"])
+def test_a_wave_that_switches_during_a_slide_is_no_surface_to_slide_along(step):
+    follows = {"follow_slides": True}
+    solver = d.FixedStep(1e-2, 2.0, **follows) if step == "fixed" else d.Adaptive(1e-8, 2.0, 1e-2, **follows)
+
+    def integral(p):
+        solution = d.solve(push_with_wave, (1.0, 0.0), 0.0, 2.0, p, solver=solver, engine="xla")
+        return solution.y[1], solution.status
+
+    frequencies = jnp.array([30.0, 50.0, 120.0])
+    values, slopes, statuses = jax.vmap(lambda p: jax.jvp(integral, (p,), (1.0,), has_aux=True))(frequencies)
+    assert not statuses.any()
+    np.testing.assert_allclose(values, [exact_wave_integral(p) for p in frequencies], rtol=1e-8)
+    for width in (1e-3, 1e-4, 1e-5):
+        ends = [[exact_wave_integral(p + side * width) for side in (-1, 1)] for p in frequencies]
+        np.testing.assert_allclose(slopes, np.diff(ends)[:, 0] / (2 * width), rtol=1e-6)
+
+
+@killed_by("engine.step.sliding_flow", "jnp.maximum(share, 1.0 - share)", "share")
+@killed_by("engine.step.sliding_flow", "jnp.where(near == beyond, MAX_SHARE, ", "jnp.where(False, MAX_SHARE, ")
+@pytest.mark.parametrize(
+    ("pushes", "share"),  # of both sides on the margin; the other side has q / (q - p), wherever the flows oppose
+    [((-1.0, 3.0), 0.25), ((-2.0, -1.0), 2.0), ((-1.0, -3.0), 1.5), ((-1.0, -1.0), 2.0), ((3.0, 1.0), -0.5)],
+)
+def test_a_run_leaves_a_surface_to_the_side_that_both_flows_push_to(pushes, share):
+    along = (SlidingSurface(jnp.asarray(0), (jnp.uint32(1),)),)
+
+    def look(t, z, mode):
+        answer = mode.words[0] & 1
+        rate = jnp.where(answer == 1, pushes[0], pushes[1])
+        answers = ComparisonAnswers(mode.words, (jnp.uint32(0),), np.array([0]), jnp.where(answer == 1, z, -z)[None])
+        return ({"z": rate},), answers
+
+    def look_at_flow(t, z, mode):
+        return look(t, z[0]["z"], mode)
+
+    dynamics = sliding_flow.slide(
+        look_at_flow, jnp.asarray(0.0), ({"z": jnp.asarray(0.0)},), Mode((jnp.uint32(1),), along=along)
+    )
+    assert dynamics.shares[0] == pytest.approx(share)
+
+
+@killed_by("engine.step.fixed", "begins = gave_up & (self.follows | (", "begins = gave_up & ((")
+def test_a_followed_run_whose_search_gives_up_is_reported(monkeypatch):
+    monkeypatch.setattr(fixed, "MAX_ATTEMPTS_PER_STEP", 0)  # no search comes to its end
+    loop, path, _ = test_slides.SLIDING["dry friction"]
+
+    def iae(x):
+        run = d.measure(replace(loop, {path: x}), FIXED, {"not compiled before": IAE()})
+        return run.metrics["not compiled before"], run.slid
+
+    _, slope, slid = jax.jvp(iae, (float(get(loop, path)),), (1.0,), has_aux=True)
+    assert slid
+    assert np.isnan(slope)
 
 
 def test_without_the_option_the_line_names_it():

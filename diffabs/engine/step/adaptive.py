@@ -84,7 +84,9 @@ RESET_STEP_FRACTION = 0.1
 # the growth of this fraction per step. An event excites the fastest modes of the derivative far more than the run's.
 INITIAL_STABILITY_FRACTION, STABILITY_FRACTION_GROWTH = 1 / 16, 1.6
 MAX_CONSECUTIVE_CROSSINGS = 16  # steps in a row that end on switching surfaces; later ones keep to no mode
-# Fraction of the duration: crossings that follow each other faster are those of a slide.
+# Fractions of the duration: crossings that follow each other more slowly are no slide, if steps keep to no mode, and if
+# the run is watched.
+CALM_FRACTION = 1e-3
 SLIDE_INTERVAL_FRACTION = 1e-6
 # A step without a mode that crosses a surface and moves back at its end adds `RETURN_SCORE`, any other one takes 1
 # away. With `MAX_RETURN_SCORE` the run slides. A return with a smaller error, as a multiple of the allowed one, is
@@ -269,8 +271,9 @@ class AdaptiveStepping:
         return True
 
     def is_calm(self, carry: Carry) -> Bool:
-        """Return True if the attempt of `carry` is not far shorter than the error allows."""
-        return carry.length > RESET_STEP_FRACTION * carry.control.error_limited
+        """Return True if the attempt of `carry` is not far shorter than the error allows, or than the whole run."""
+        apart = CALM_FRACTION * self.h * self.steps  # without an error a step may be as long as the run
+        return carry.length > jnp.minimum(RESET_STEP_FRACTION * carry.control.error_limited, apart)
 
     def propose(self, system: ObservedSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
@@ -349,7 +352,7 @@ class AdaptiveStepping:
         watch = after.slides
         if self.keeps_mode:
             calm = accepted & new & (carry.length > RESET_STEP_FRACTION * control.error_limited)
-            if self.watches:
+            if self.watches or self.follows:
                 # Steps without an error are as long as the run, so that no step counts as long beside them.
                 apart = carry.length > SLIDE_INTERVAL_FRACTION * self.h * self.steps
                 calm, crossings = calm | (accepted & new & apart), jnp.where(apart, 0, crossings)
@@ -367,6 +370,9 @@ class AdaptiveStepping:
                 slides = gave_up | (accepted & (crossings > MAX_CONSECUTIVE_CROSSINGS))
                 unrestricted = new & ~decision.valid & (carry.length <= self.closest) & ~carry.unrestricted
                 length = jnp.where(unrestricted, carry.length, length)
+            if self.follows and watch:  # without a mode it would chatter
+                lost_slide = begin_slide(watch.lost, becomes_unrestricted, after.search.number, after.point.t)
+                after = after._replace(slides=watch._replace(lost=lost_slide))
             searches &= ~(becomes_unrestricted & gave_up)
             length = jnp.where(becomes_unrestricted & gave_up, longest, length)
             status = jnp.where(becomes_unrestricted & gave_up, RunStatus.RUNNING, status)

@@ -51,6 +51,7 @@ from diffabs.engine.step.slides import (
     begins_along,
     decided_answers,
     init_watch,
+    lose_unrestricted,
     watch_landing,
 )
 from diffabs.engine.step.sliding_flow import MAX_SURFACES
@@ -163,7 +164,7 @@ class Stepping(Protocol):
         ...
 
     def is_calm(self, carry: Carry) -> Bool:
-        """Return True if the attempt of `carry` is so long that an earlier landing is over."""
+        """Return True if the attempt of `carry` is so long that earlier landings are over."""
         ...
 
     def propose(self, system: ObservedSystem, carry: Carry) -> StepRequest:
@@ -268,6 +269,8 @@ def advance(
     elif stepping.smooth:
         after = after._replace(status=_next_status(system, carry, attempt, decision, carry.status))
     after = stepping.plan_next(system, carry, attempt, decision, after)
+    if along_of(after):
+        after = after._replace(slides=lose_unrestricted(after.slides, active & after.unrestricted, attempt.point.t))
     status = jnp.where(active, after.status, carry.status).astype(carry.status.dtype)
     status, unrestricted = keep_decision((status, after.unrestricted))
     after = after._replace(status=status, unrestricted=unrestricted)
@@ -280,7 +283,8 @@ def _watch_slides(
     stepping: Stepping, ticks: bool, carry: Carry, attempt: Attempt, decision: Decision, request: StepRequest
 ) -> SlideWatch:
     """Return the watch for slides after an attempt."""
-    calm = decision.accepted & (carry.status == RunStatus.RUNNING) & stepping.is_calm(carry)
+    regular = carry.status == RunStatus.RUNNING
+    calm = decision.accepted & stepping.is_calm(carry) & (regular | decision.crosses_surface)
     reset = reduce(jnp.logical_or, jax.tree.leaves(decision.triggered))
     if ticks:  # a block may have changed
         reset |= decision.accepted & request.strikes

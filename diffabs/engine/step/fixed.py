@@ -37,7 +37,8 @@ from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, Objectives, Ob
 
 EVENT_ATTEMPTS_PER_STEP, SPARE_ATTEMPTS = 4, 64  # attempts to locate events: for each step of the grid, and in addition
 CROSSING_ATTEMPTS_PER_STEP = 1  # attempts on switching surfaces per step of the grid; beyond, steps are unrestricted
-MAX_ATTEMPTS_PER_STEP = 32  # attempts within one step of the grid; beyond, steps are unrestricted
+FOLLOWED_ATTEMPTS_PER_STEP = 4  # the same in a run that follows surfaces, and is lost where its steps are unrestricted
+MAX_ATTEMPTS_PER_STEP = 32  # attempts within one step of the grid, as a multiple of these
 CALM_STEP_FRACTION = 0.02  # of a step of the grid: after a longer step without a landing, a run does not slide
 # Greatest change of a state in a step: a multiple of the rates at both ends, plus a fraction of the state.
 MAX_RATE_RATIO, MAX_STATE_FRACTION = 4, 1e-3
@@ -107,6 +108,11 @@ class FixedStepping:
         """True if the rates of all margins are evaluated."""
         return self.watches
 
+    @property
+    def crossing_attempts(self) -> int:
+        """Attempts on switching surfaces per step of the grid; beyond, steps are unrestricted."""
+        return FOLLOWED_ATTEMPTS_PER_STEP if self.follows else CROSSING_ATTEMPTS_PER_STEP
+
     def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `hybrid`, `objectives` and random `key`."""
         foresee = partial(look_ahead, jnp.asarray(True), -1) if self.watches else lambda dynamics: ()
@@ -138,7 +144,7 @@ class FixedStepping:
         """
         if self.smooth:
             return steps
-        crossings = CROSSING_ATTEMPTS_PER_STEP if self.kinks is not False else 0
+        crossings = self.crossing_attempts if self.kinks is not False else 0
         about = (crossings + (EVENT_ATTEMPTS_PER_STEP if hybrid.eventful else 0)) * steps + SPARE_ATTEMPTS
         return steps + SPARE_ATTEMPTS + about + about // 3
 
@@ -147,8 +153,8 @@ class FixedStepping:
         return hybrid.jumps if self.kinks is None else self.kinks
 
     def is_calm(self, carry: Carry) -> Bool:
-        """Return True if the attempt of `carry` goes to the grid, and is no short rest of a step."""
-        return carry.strikes & (carry.length > CALM_STEP_FRACTION * self.h)
+        """Return True if the attempt of `carry` is no short rest of a step."""
+        return carry.length > CALM_STEP_FRACTION * self.h
 
     def propose(self, system: ObservedSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
@@ -200,22 +206,23 @@ class FixedStepping:
         in_step = jnp.where(on_grid, 0, control.in_step + extra - control.extra)
         unrestricted, status = carry.unrestricted, after.status
         if system.program:
-            crowded = control.in_step >= MAX_ATTEMPTS_PER_STEP
+            crowded = control.in_step >= self.crossing_attempts * MAX_ATTEMPTS_PER_STEP
             gave_up = (
                 crowded
                 | (after.search.tries >= MAX_LOCATION_ATTEMPTS)
-                | (control.extra > CROSSING_ATTEMPTS_PER_STEP * carry.k + SPARE_ATTEMPTS)
+                | (control.extra > self.crossing_attempts * carry.k + SPARE_ATTEMPTS)
             )
             gave_up &= decision.searches & (after.search.number < system.bit_count)
             if watch := after.slides:
-                # So many landings within one step that there is no room for another return.
-                begins = gave_up & crowded & (watch.returns > 0)
+                # So many landings within one step that there is no room for another return. A run that follows surfaces
+                # and cannot find one is lost, too: without a mode it would chatter.
+                begins = gave_up & (self.follows | (crowded & (watch.returns > 0)))
                 slide = begin_slide(watch.lost, begins, after.search.number, after.point.t)
                 after = after._replace(slides=watch._replace(lost=slide))
             becomes_unrestricted = ~decision.accepted & ~unrestricted & (~decision.valid | gave_up)
             unrestricted = (unrestricted | becomes_unrestricted) & ~(on_grid & have_same_answers(carry, attempt))
             status = jnp.where(becomes_unrestricted, RunStatus.RUNNING, status)
-        max_extra = (EVENT_ATTEMPTS_PER_STEP + CROSSING_ATTEMPTS_PER_STEP) * self.steps + SPARE_ATTEMPTS
+        max_extra = (EVENT_ATTEMPTS_PER_STEP + self.crossing_attempts) * self.steps + SPARE_ATTEMPTS
         lost = ~decision.valid & (carry.unrestricted if system.program else True)
         if self.watches:
             grazes = attempt.report.grazes & (decision.accepted | decision.searches)

@@ -88,7 +88,7 @@ class Landing(NamedTuple):
         search: The search whose result it is.
         words: Its mode.
         landed: True if it was accepted and ends on a switching surface.
-        calm: True if it was an accepted step without a landing.
+        calm: True if it was accepted and so long that what has landed before is over.
         reset: True if the state changes at its end.
         t: Time at its end [s].
     """
@@ -117,12 +117,12 @@ def watch_landing(watch: SlideWatch, landing: Landing) -> SlideWatch:
     """Return the watch after an attempt."""
     search, _, landed, calm, reset, t = landing
     bits = single_bit(jnp.where(landed, search.number, -1), len(watch.met))
-    again = jnp.any(jnp.stack([(met & bit) != 0 for met, bit in zip(watch.met, bits, strict=True)]))
+    again = ~calm & jnp.any(jnp.stack([(met & bit) != 0 for met, bit in zip(watch.met, bits, strict=True)]))
     line = search.fall * search.place
     straight = jnp.abs(search.margin - line) <= -MAX_LINE_ERROR * line
     counts = jnp.where(search.at_once, jnp.where(straight, RETURN_AT_ONCE, 0), jnp.where(search.fall < 0, 1, 0))
     returns = jnp.where(calm, 0, watch.returns + jnp.where(again, counts, 0))
-    met = tuple(jnp.where(calm, jnp.uint32(0), met | bit) for met, bit in zip(watch.met, bits, strict=True))
+    met = tuple(jnp.where(calm, bit, met | bit) for met, bit in zip(watch.met, bits, strict=True))
     slides, followed = returns >= MAX_RETURNS, watch.followed
     if followed:
         followed, full = _follow(followed, landing, landed & again & ~reset & (counts > 0) & slides)
@@ -169,6 +169,14 @@ def begin_slide(slide: Slide, begins: Bool, number: Int, t: Scalar) -> Slide:
     """Return the lost slide, or a new one along the comparison `number` if it begins and is the first."""
     first = begins & (slide.comparison < 0)
     return Slide(jnp.where(first, number, slide.comparison), jnp.where(first, jax.lax.stop_gradient(t), slide.t))
+
+
+def lose_unrestricted(watch: SlideWatch, unrestricted: Bool, t: Scalar) -> SlideWatch:
+    """Return the watch; a slide is lost where the steps of its run keep to no mode, and so to no surface."""
+    lost = watch.lost
+    for surface in _surfaces(watch):
+        lost = begin_slide(lost, unrestricted & surface.exists, surface.number, t)
+    return watch._replace(lost=lost)
 
 
 def along_of(carry: Any) -> tuple[SlidingSurface, ...]:

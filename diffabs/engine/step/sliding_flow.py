@@ -23,6 +23,7 @@ from diffabs.engine.step.modes import ComparisonAnswers, Mode, ModeBits, Sliding
 from diffabs.engine.step.surfaces import read_bits
 
 MAX_SURFACES = 2  # along which a run can slide at the same time
+MAX_SHARE = 2.0  # of the other side, where the run leaves a surface to it
 
 Look = Callable[[Scalar, PyTree, Mode], tuple[PyTree, ComparisonAnswers]]  # of time, flow, mode; begins with the rates
 
@@ -65,7 +66,8 @@ def slide(look: Look, t: Scalar, z: PyTree, mode: Mode) -> SlidingDynamics:
     def mix(x: Array) -> AnyArray:
         return sum((share * (x[i] - x[0]) for i, share in enumerate(shares, 1)), x[0]) if _is_real(x) else x[0]
 
-    return SlidingDynamics(jax.tree.map(mix, sides.dynamics), _answer_by_shares(sides.answers, mode, shares), shares)
+    judged = _turn_outward(shares, sides.pushes)
+    return SlidingDynamics(jax.tree.map(mix, sides.dynamics), _answer_by_shares(sides.answers, mode, judged), judged)
 
 
 def return_to_surfaces(look: Look, t: Scalar, z: PyTree, mode: Mode) -> PyTree:
@@ -130,6 +132,22 @@ def _balance(pushes: list[Array], along: tuple[SlidingSurface, ...], excesses: l
     (a, b), (c, d) = rows
     determinant = a * d - b * c
     return ratio(rests[0] * d - b * rests[1], determinant), ratio(a * rests[1] - rests[0] * c, determinant)
+
+
+def _turn_outward(shares: tuple[Scalar, ...], pushes: list[Array]) -> tuple[Scalar, ...]:
+    """Return the shares; where both sides of a surface push the same way, beyond 0 or 1 on the side they push to.
+
+    There -p/(q - p), with the pushes p < q < 0 or q < p < 0, is beyond 1 or below 0. The run crosses in both cases.
+    """
+    outward = []
+    for place, (rates, share) in enumerate(zip(pushes, shares, strict=True)):
+        more = [other * (rates[i] - rates[0]) for i, other in enumerate(shares, 1) if i != place + 1]
+        near = sum(more, rates[0])
+        beyond = near + rates[place + 1] - rates[0]
+        far = jnp.where(near == beyond, MAX_SHARE, jnp.clip(jnp.maximum(share, 1.0 - share), 1.0, MAX_SHARE))
+        share = jnp.where((near < 0) & (beyond < 0), far, jnp.where((near > 0) & (beyond > 0), 1.0 - far, share))
+        outward.append(share)
+    return tuple(outward)
 
 
 def _answer_by_shares(answers: ComparisonAnswers, mode: Mode, shares: tuple[Scalar, ...]) -> ComparisonAnswers:
