@@ -90,6 +90,36 @@ def distances_behind_an_edge(tables):
     return rows
 
 
+def distances_over_roads(tables):
+    names = {"slip estimator": "proposed", "slip estimator, noise": "proposed, noise 0.1 m/s2"}
+    rows, printed = {row["control"]: row for row in tables["table"]}, {}
+    for words, name in names.items():
+        row, paper = rows[name], "" if words == "slip estimator" else ", paper's gains {:.3f}"
+        paper_worst = row["worst lane, paper's"]
+        printed[words] = [
+            f"{abs(row['shorter [%]']):.2f} +- {row['+- [%]']:.2f} % longer",
+            f"{row['tuned']:.3f}" + paper.format(row["paper's gains: distance/shortest"]),
+            f"{row['worst lane, tuned']:.2f}, paper's gains {paper_worst:.2f}",
+            str(row["not stopped"]),
+        ]
+    return printed
+
+
+def overshoots_at_weak_spots(tables):
+    names = {"published gain": "published gain", "LMI, k1 as published": "LMI, same k1", "**tuned**": "the cure"}
+    rows = {row["controller"]: row for row in tables["weak_spots"]}
+    printed = {}
+    for words, name in names.items():
+        spots = [two_places(value) for key, value in rows[name].items() if key != "controller"]
+        *others, low_1, low_5, noise = spots[3:]
+        printed[words] = [", ".join(spots[:3]), *others, noise, f"{low_1}, {low_5}"]
+    return printed
+
+
+def two_places(percent):
+    return f"{percent:.0f}" if percent >= 10 else f"{percent:.1f}"
+
+
 def recovered_by_two_angles(tables):
     shares = ("95 % of the seeds", "half of the seeds")
     columns = {"multiple": "every seed recovers up to", **dict(zip(shares, shares, strict=True))}
@@ -121,6 +151,8 @@ def recovered_by_weights(tables):
         ("lab_rig", critical_lags),
         ("mean_intervals", coverages),
         ("slip_estimator", distances_behind_an_edge),
+        ("overshoot_cured", overshoots_at_weak_spots),
+        ("pid_over_roads", distances_over_roads),
         ("two_wheeler", recovered_by_two_angles),
         ("two_wheeler", recovered_by_weights),
     ],
