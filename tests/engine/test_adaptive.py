@@ -17,6 +17,8 @@ from diffabs import actuators, controllers, plants, references, roads, stops
 from diffabs.core.cubic import Cubic, HermiteStep
 from diffabs.core.protocols import Memory
 from diffabs.core.pytree import arrays, get, prepare_parts, refine_parts
+from diffabs.engine.admission import build_field
+from diffabs.engine.drive.runs import build_stepping
 from diffabs.engine.step import step_size, surfaces
 from diffabs.engine.step.adaptive import StateSpan
 from diffabs.engine.step.replay import BASE_LOG_CAPACITY, log_capacity, states_between
@@ -445,6 +447,17 @@ def test_steps_that_find_themselves_are_never_unstable():
     d.check(loop, d.Adaptive(1e-5, 4.0, 1e-2))
 
 
+@killed_by("engine.step.adaptive", "(control.tries == 0) & (carry.length > limit)", "(carry.length < 0)")
+def test_the_first_step_is_stable():
+    """A run at rest has no error, and a step that is too long would only spoil its derivative."""
+    decay = 1e6
+    system, _ = build_field(lambda t, y, args: -decay * y, 0.0, 0.0, 1.0, None, (), None, 1)
+    method = build_stepping(d.Adaptive(1e-6, 1.0, 1.0), jnp.dtype(float))
+    carry = jax.jit(lambda: method.renew(system, method.start(system, {}, None)))()
+    assert 0 < carry.length <= 3.0 * (1 + 1e-9) / decay
+    assert carry.base == carry.length
+
+
 @killed_by(
     "engine.step.surfaces", "jnp.where(since < -nearest, -since, NEVER_S)", "jnp.where(since < 0, -since, NEVER_S)"
 )
@@ -457,9 +470,8 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
     np.testing.assert_array_equal(surfaces.read_bits(words, np.array([2, 3, 33, 1])), [True, True, True, False])
     length = jnp.asarray(1.0)
     assert surfaces.forecast_crossing(margins, length, 0.0) == pytest.approx(0.1)  # 3 falls by 40/s
-    assert surfaces.forecast_crossing(margins, length, 0.2) == pytest.approx(
-        2.0
-    )  # 0.1 s counts as past, 1 rises by 1/s
+    # 0.1 s counts as past, and the number 1 rises by 1/s.
+    assert surfaces.forecast_crossing(margins, length, 0.2) == pytest.approx(2.0)
     assert surfaces.find_imminent(margins, length).number == 3
     # Bits 2 and 33 changed 0.5 s and 0.25 s ago.
     assert surfaces.time_since_crossing(margins, words, length) == pytest.approx(0.5)

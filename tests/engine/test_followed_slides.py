@@ -170,10 +170,11 @@ def test_a_wave_that_switches_during_a_slide_is_no_surface_to_slide_along(step):
         np.testing.assert_allclose(slopes, np.diff(ends)[:, 0] / (2 * width), rtol=1e-6)
 
 
-@killed_by("engine.step.sliding_flow", "jnp.maximum(share, 1.0 - share)", "share")
+@killed_by("engine.step.sliding_flow", "larger(share, 1.0 - share)", "share")
 @killed_by("engine.step.sliding_flow", "jnp.where(near == beyond, MAX_SHARE, ", "jnp.where(False, MAX_SHARE, ")
+# The rates p and q of the margin on this and on the other side; where they oppose, the other side's share is p/(p - q).
 @pytest.mark.parametrize(
-    ("pushes", "share"),  # of both sides on the margin; the other side has q / (q - p), wherever the flows oppose
+    ("pushes", "share"),
     [((-1.0, 3.0), 0.25), ((-2.0, -1.0), 2.0), ((-1.0, -3.0), 1.5), ((-1.0, -1.0), 2.0), ((3.0, 1.0), -0.5)],
 )
 def test_a_run_leaves_a_surface_to_the_side_that_both_flows_push_to(pushes, share):
@@ -194,7 +195,7 @@ def test_a_run_leaves_a_surface_to_the_side_that_both_flows_push_to(pushes, shar
     assert dynamics.shares[0] == pytest.approx(share)
 
 
-@killed_by("engine.step.fixed", "begins = gave_up & (self.follows | (", "begins = gave_up & ((")
+@killed_by("engine.step.slides", "unrestricted & (slides | gives_up)", "unrestricted & slides")
 def test_a_followed_run_whose_search_gives_up_is_reported(monkeypatch):
     monkeypatch.setattr(fixed, "MAX_ATTEMPTS_PER_STEP", 0)  # no search comes to its end
     loop, path, _ = test_slides.SLIDING["dry friction"]

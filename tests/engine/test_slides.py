@@ -215,7 +215,10 @@ def test_a_sliding_run_with_adaptive_steps_is_reported(name):
         run = d.measure(d.replace(loop, {path: x}), d.Adaptive(1e-6, END, 1e-2), objectives)
         return run.metrics["iae"], run
 
-    for run in (iae(at)[1], jax.jacfwd(iae, has_aux=True)(at)[1]):
+    runs = [iae(at)[1], jax.jacfwd(iae, has_aux=True)(at)[1]]
+    if name == "dry friction" and not runs[0].slid:  # by rounding the speed may become 0 exactly, and then it stays
+        assert runs.pop(0).metrics["iae"] == pytest.approx(1.0 / (2.0 * at), rel=1e-6)
+    for run in runs:
         assert run.slid
         assert run.diverged
         assert np.isnan(run.metrics["iae"])

@@ -64,7 +64,6 @@ from diffabs.engine.step.step_size import (
     spectral_step_limit,
 )
 from diffabs.engine.step.surfaces import (
-    NO_SURFACES,
     find_imminent,
     find_return,
     forecast_crossing,
@@ -84,10 +83,9 @@ RESET_STEP_FRACTION = 0.1
 # the growth of this fraction per step. An event excites the fastest modes of the derivative far more than the run's.
 INITIAL_STABILITY_FRACTION, STABILITY_FRACTION_GROWTH = 1 / 16, 1.6
 MAX_CONSECUTIVE_CROSSINGS = 16  # steps in a row that end on switching surfaces; later ones keep to no mode
-# Fractions of the duration: crossings that follow each other more slowly are no slide, if steps keep to no mode, and if
-# the run is watched.
-CALM_FRACTION = 1e-3
-SLIDE_INTERVAL_FRACTION = 1e-6
+# Fractions of the duration. A step longer than the first ends the watch for a slide: its landings are no returns. Of a
+# run that is watched or follows surfaces, one longer than the second resets the count of consecutive crossings.
+CALM_FRACTION, SLIDE_INTERVAL_FRACTION = 1e-3, 1e-6
 # A step without a mode that crosses a surface and moves back at its end adds `RETURN_SCORE`, any other one takes 1
 # away. With `MAX_RETURN_SCORE` the run slides. A return with a smaller error, as a multiple of the allowed one, is
 # rounding.
@@ -220,7 +218,7 @@ class AdaptiveStepping:
         point, zero, no = carry.point, carry.k, carry.unrestricted
         state = borrow(point.state, None)
         scale = error_scales(state, point.sample)
-        limit = self.h * self.steps  # until the first renewal, before the first step
+        limit = self.h * self.steps  # until the first `renew`, before the first attempt
         to_strike = self._next_strike(hybrid, zero) * self.h
         length, strikes = plan_step(error_limited, self._ahead(point), to_strike)
         last = span_step(point, point) if self.keeps_last_step else ()
@@ -242,7 +240,11 @@ class AdaptiveStepping:
         # One condition for the whole batch: `cond` with one for each run would execute both branches.
         limit = jax.lax.cond(any_lane(due), renew_due, lambda: control.limit)
         renewed = jnp.where(due, control.tries, control.tries_at_renewal)
-        return carry._replace(control=control._replace(limit=limit, tries_at_renewal=renewed))
+        # The first attempt was planned without a limit; `plan_next` limits all others.
+        too_long = due & (control.tries == 0) & (carry.length > limit)
+        length, base = (jnp.where(too_long, limit, x) for x in (carry.length, carry.base))
+        control = control._replace(limit=limit, tries_at_renewal=renewed)
+        return carry._replace(length=length, base=base, strikes=carry.strikes & ~too_long, control=control)
 
     def is_active(self, carry: Carry, until: Int | None) -> Bool:
         """Return True if the run of `carry` goes on and has not reached the instant `until` of the grid."""
@@ -370,9 +372,6 @@ class AdaptiveStepping:
                 slides = gave_up | (accepted & (crossings > MAX_CONSECUTIVE_CROSSINGS))
                 unrestricted = new & ~decision.valid & (carry.length <= self.closest) & ~carry.unrestricted
                 length = jnp.where(unrestricted, carry.length, length)
-            if self.follows and watch:  # without a mode it would chatter
-                lost_slide = begin_slide(watch.lost, becomes_unrestricted, after.search.number, after.point.t)
-                after = after._replace(slides=watch._replace(lost=lost_slide))
             searches &= ~(becomes_unrestricted & gave_up)
             length = jnp.where(becomes_unrestricted & gave_up, longest, length)
             status = jnp.where(becomes_unrestricted & gave_up, RunStatus.RUNNING, status)
@@ -441,7 +440,7 @@ class AdaptiveStepping:
 
     def _select_watched(self, dynamics: Evaluation) -> Evaluation:
         """Return the dynamics with those margins only whose turns are looked for: of events, or all if it `watches`."""
-        return dynamics if self.watches else dynamics._replace(surfaces=NO_SURFACES)
+        return dynamics if self.watches else dynamics._replace(surfaces=dynamics.surfaces.take_none())
 
     def _next_strike(self, hybrid: HybridSystem, k: Int) -> Int:
         """Return the number of the first grid instant after the `k`-th at which a clock strikes or the run ends."""

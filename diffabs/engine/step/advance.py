@@ -51,7 +51,7 @@ from diffabs.engine.step.slides import (
     begins_along,
     decided_answers,
     init_watch,
-    lose_unrestricted,
+    lose_mode,
     watch_landing,
 )
 from diffabs.engine.step.sliding_flow import MAX_SURFACES
@@ -270,7 +270,9 @@ def advance(
         after = after._replace(status=_next_status(system, carry, attempt, decision, carry.status))
     after = stepping.plan_next(system, carry, attempt, decision, after)
     if along_of(after):
-        after = after._replace(slides=lose_unrestricted(after.slides, active & after.unrestricted, attempt.point.t))
+        gives_up = jnp.logical_and(decision.valid, ~carry.unrestricted)
+        unrestricted, number = active & after.unrestricted, after.search.number
+        after = after._replace(slides=lose_mode(after.slides, unrestricted, gives_up, number, attempt.point.t))
     status = jnp.where(active, after.status, carry.status).astype(carry.status.dtype)
     status, unrestricted = keep_decision((status, after.unrestricted))
     after = after._replace(status=status, unrestricted=unrestricted)

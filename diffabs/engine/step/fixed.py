@@ -214,9 +214,8 @@ class FixedStepping:
             )
             gave_up &= decision.searches & (after.search.number < system.bit_count)
             if watch := after.slides:
-                # So many landings within one step that there is no room for another return. A run that follows surfaces
-                # and cannot find one is lost, too: without a mode it would chatter.
-                begins = gave_up & (self.follows | (crowded & (watch.returns > 0)))
+                # So many landings within one step that there is no room for another return.
+                begins = gave_up & crowded & (watch.returns > 0)
                 slide = begin_slide(watch.lost, begins, after.search.number, after.point.t)
                 after = after._replace(slides=watch._replace(lost=slide))
             becomes_unrestricted = ~decision.accepted & ~unrestricted & (~decision.valid | gave_up)

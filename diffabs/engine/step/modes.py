@@ -254,8 +254,10 @@ class ComparisonTrace:
 
 
 def stack_flat(arrays: Sequence[object]) -> Array:
-    """Return all numbers of the arrays in one vector; in few operations, since a program has one for each."""
-    return jnp.concatenate([jnp.ravel(jnp.asarray(x)) for x in arrays])
+    """Return all numbers of the arrays in one vector."""
+    vectors = [jnp.ravel(jnp.asarray(x)) for x in arrays]
+    # An empty vector would only decide the type: that of a loop in float32 is not the default type.
+    return jnp.concatenate([vector for vector in vectors if vector.size] or vectors)
 
 
 def _ones(count: Array) -> Array:

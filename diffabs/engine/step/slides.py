@@ -171,12 +171,13 @@ def begin_slide(slide: Slide, begins: Bool, number: Int, t: Scalar) -> Slide:
     return Slide(jnp.where(first, number, slide.comparison), jnp.where(first, jax.lax.stop_gradient(t), slide.t))
 
 
-def lose_unrestricted(watch: SlideWatch, unrestricted: Bool, t: Scalar) -> SlideWatch:
-    """Return the watch; a slide is lost where the steps of its run keep to no mode, and so to no surface."""
-    lost = watch.lost
-    for surface in _surfaces(watch):
-        lost = begin_slide(lost, unrestricted & surface.exists, surface.number, t)
-    return watch._replace(lost=lost)
+def lose_mode(watch: SlideWatch, unrestricted: Bool, gives_up: Bool, number: Array, t: Scalar) -> SlideWatch:
+    """Return the watch; the slide is lost of a run whose steps are `unrestricted`, for without a mode it would chatter.
+
+    That holds during a slide, and where a search `gives_up`: it may have been for the landing that begins one.
+    """
+    slides = reduce(jnp.logical_or, [surface.exists for surface in _surfaces(watch)])
+    return watch._replace(lost=begin_slide(watch.lost, unrestricted & (slides | gives_up), number, t))
 
 
 def along_of(carry: Any) -> tuple[SlidingSurface, ...]:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.numerics import ratio
+from diffabs.core.numerics import clamp, larger, ratio
 from diffabs.core.types import AnyArray, Array, PyTree, Scalar
 from diffabs.engine.step.modes import ComparisonAnswers, Mode, ModeBits, SlidingSurface, pick_number, single_bit
 from diffabs.engine.step.surfaces import read_bits
@@ -144,7 +144,7 @@ def _turn_outward(shares: tuple[Scalar, ...], pushes: list[Array]) -> tuple[Scal
         more = [other * (rates[i] - rates[0]) for i, other in enumerate(shares, 1) if i != place + 1]
         near = sum(more, rates[0])
         beyond = near + rates[place + 1] - rates[0]
-        far = jnp.where(near == beyond, MAX_SHARE, jnp.clip(jnp.maximum(share, 1.0 - share), 1.0, MAX_SHARE))
+        far = jnp.where(near == beyond, MAX_SHARE, clamp(larger(share, 1.0 - share), 1.0, MAX_SHARE))
         share = jnp.where((near < 0) & (beyond < 0), far, jnp.where((near > 0) & (beyond > 0), 1.0 - far, share))
         outward.append(share)
     return tuple(outward)

@@ -7,7 +7,6 @@ ahead or in the past. A step that ends there has its kink at its end, where the 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 
 from diffabs.core.types import AnyArray, Array, Bool, Int, Scalar
 from diffabs.engine.step.modes import ModeBits, split_number
@@ -40,8 +39,9 @@ class SwitchingFunctions(NamedTuple):
         assert self.rates is not None
         return self.values / self.rates
 
-
-NO_SURFACES = SwitchingFunctions(np.zeros(0, int), np.zeros(0), np.zeros(0))  # pyright: ignore[reportArgumentType]
+    def take_none(self) -> "SwitchingFunctions":
+        """Return no functions, of the same types."""
+        return SwitchingFunctions(self.numbers[:0], self.values[:0], None if self.rates is None else self.rates[:0])
 
 
 def forecast_crossing(surfaces: SwitchingFunctions, natural: Scalar, shortest: Scalar) -> Scalar:

@@ -138,7 +138,8 @@ class ObservedSystem(NamedTuple):
 
         def look(t: Scalar, z: PyTree, mode: Mode) -> tuple[Instant, ComparisonAnswers]:
             if self.program is None:
-                return _evaluate((t, *z), fixed), ComparisonAnswers((), (), np.zeros(0, int), jnp.zeros(0))
+                none = ComparisonAnswers((), (), np.zeros(0, int), jnp.zeros_like(t, shape=(0,)))
+                return _evaluate((t, *z), fixed), none
             return self.program.look(lambda dynamics: dynamics, (t, *z), fixed, mode)
 
         def look_aside(t: Scalar, z: PyTree) -> SlidingDynamics:

@@ -91,8 +91,8 @@ def draw_pareto(
 def pareto_front(x: Scalar, y: Scalar) -> np.ndarray:
     """Return the indices of the Pareto-optimal points (both objectives are minimised), in ascending order of x.
 
-    A point is left out if another point is at least as small in both objectives. Of equal points one is kept. Points
-    that are not finite are left out.
+    The objectives `x` and `y` have shape (n,). A point is left out if another one is at least as small in both, or if a
+    number is not finite. Of equal points one is kept.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     # In the order of x (of equal x the smallest y first), a point is on the front if its y is a new minimum.

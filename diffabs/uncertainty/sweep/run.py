@@ -102,9 +102,9 @@ def sweep(
         source: Texts for the manifest, by name, such as the scenario.
 
     Raises:
-        ValueError: `study` is no Study, cannot be run, or its engine cannot run it; a note of `source` is no text; or
-            JAX runs in several processes.
-        SweepError: The folder contains something else, is in use, or cannot be written.
+        ValueError: `study` is no Study, or cannot be run; a note of `source` is no text; or JAX runs in several
+            processes.
+        SweepError: The folder contains something else, is in use, or cannot be written; or no kernel can make the runs.
         OSError: The disk is full. Finished chunks stay, and `resume` continues.
 
     See also:
