@@ -46,6 +46,7 @@ BISECT = 4  # every fourth attempt halves the bracket
 # Fraction of the margin's mean rate in the step. A margin with a slower fall at the beginning only touches zero there.
 GRAZING_FRACTION = 1e-2
 # Fraction of the slope: greatest correction by the cubic through both ends of a step. A larger correction is a kink.
+MAX_PROBE_BEND = 0.1  # greatest share of the slope by which it may change between the place and the probe
 MAX_CUBIC_CORRECTION = 1e-4
 # Fraction of the fall: greatest change within a step in which the margin counts as smooth.
 MAX_SLOPE_CHANGE = 0.5
@@ -256,8 +257,13 @@ def _locate_event(search: EventSearch, x: Scalar, crossings: AttemptCrossings) -
     ends = (search.full, search.at_full), (0.0 * x, start)
     side, opposite = select(margin < 0, ends, ends[::-1])
     same_side = _shows_curvature(side, place, x)
-    end, at_end = third = select(same_side, side, opposite)
+    third = select(same_side, side, opposite)
     fall = (g - margin) / (x - place)
+    # Over a long attempt the margin may be no parabola. Then the bracket's end beyond the place is a nearer point.
+    bends = jnp.abs(ratio(third[1] - g, third[0] - x) - fall) * jnp.abs(ratio(place - x, third[0] - place))
+    nearer = select(margin < 0, (search.near, search.at_near), (search.far, search.at_far))
+    takes_nearer = (bends > MAX_PROBE_BEND * jnp.abs(fall)) & jnp.isfinite(nearer[1]) & (nearer[0] != place)
+    end, at_end = third = select(takes_nearer, nearer, third)
     changes = ratio(at_end - g, end - x) - fall
     curved = same_side | (_shows_curvature(third, place, x) & (jnp.abs(changes) <= MAX_SLOPE_CHANGE * jnp.abs(fall)))
     # Newton's divided differences: `fall` is the first, `bend` the second.
