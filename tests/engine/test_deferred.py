@@ -181,6 +181,14 @@ def test_only_the_values_of_a_single_run_stay_with_xla(engines):
     assert engines() == [f"1 run: {why}", "1 run with 1 derivative: a kernel"]
 
 
+@killed_by("engine.drive.deferred", ' and default_platform() == "cpu"', "")
+def test_a_single_run_on_a_gpu_is_a_kernels(monkeypatch):
+    program = jax.make_jaxpr(decay)(3.0, 0.5)
+    assert deferred.find_kernels(program)[0][1]
+    replace_seam(monkeypatch, "deferred_platform", lambda: "gpu")
+    assert [objection for _, objection in deferred.find_kernels(program)] == [""]
+
+
 @pytest.mark.slow
 def test_second_derivatives_are_xlas(engines):
     compare(lambda f: jax.hessian(f, (0, 1))(3.0, 1.0))

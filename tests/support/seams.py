@@ -39,6 +39,7 @@ SEAMS = {
     "find_compiler": "diffabs.compiler.runtime.toolchain.find_compiler",
     "load_driver": "diffabs.compiler.runtime.gpu._load_driver",
     "default_platform": "diffabs.engine.drive.sharding.default_platform",
+    "deferred_platform": "diffabs.engine.drive.deferred.default_platform",
     "gpu_devices": "diffabs.compiler.runtime.gpu.default_devices",
     "find_gpu": "diffabs.compiler.runtime.gpu.find_gpu",
     "vectors_per_block": "diffabs.compiler.pipeline.VECTORS_PER_BLOCK",

@@ -43,7 +43,7 @@ from diffabs.engine.drive.engine import EngineError, check_process, describe_eng
 from diffabs.engine.hybrid import Finish
 from diffabs.host.process import default_platform
 
-MIN_RUNS = 2  # runs whose values a kernel makes: the values of one run wait longer for its compiler than for XLA
+MIN_RUNS = 2  # runs whose values a kernel makes on a processor: one run waits longer for its compiler than for XLA
 MAX_DIRECTIONS = 32  # inputs of a run up to which a kernel's Jacobian costs about what XLA's reverse mode does
 MANY_INPUTS_REASON = f"a run has more than {MAX_DIRECTIONS} inputs"
 MAX_KEPT_PROGRAMS = 64  # traced kernels that are kept, by the structure and the shapes of their runs
@@ -295,7 +295,8 @@ def _find_kernel(call: _Call, arguments: Sequence[Any], objection: str) -> tuple
     required, program = call.deferred.required, None
     if required:
         check_process()
-    if not objection and call.tangent_leaves is None and call.count_runs(arguments) < MIN_RUNS and not required:
+    single = call.tangent_leaves is None and call.count_runs(arguments) < MIN_RUNS
+    if not objection and single and default_platform() == "cpu" and not required:
         objection = "the values of a single run would wait for its compiler"
     if not objection:
         program = _trace_kernel(call, tuple(map(_type, arguments)), default_platform(), os.environ.get(COMPILER))
