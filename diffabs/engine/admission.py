@@ -23,6 +23,7 @@ from diffabs.engine.step.adaptive import AdaptiveStepping
 from diffabs.engine.step.comparisons import SwitchedProgram
 from diffabs.engine.step.fixed import FixedStepping
 from diffabs.engine.step.inner_functions import HOST_CALLS
+from diffabs.engine.step.switching import WatchedModes
 from diffabs.engine.step.system import build_system
 
 MAX_TIME_LOSS = 1e-4  # rounding of t0 and t1, as a fraction of the span
@@ -150,8 +151,7 @@ def read_solver(
     if isinstance(solver, FixedStep):
         count = solver.steps
         solver = FixedStep(1.0 / count, 1.0, kinks=True, follow_slides=solver.follow_slides)
-    method = dataclasses.replace(build_stepping(solver, dtype), watches=True)
-    return dataclasses.replace(method, keeps_mode=True) if isinstance(method, AdaptiveStepping) else method, count
+    return dataclasses.replace(build_stepping(solver, dtype), switches=WatchedModes(solver.follow_slides)), count
 
 
 def _read_functions(

@@ -4,7 +4,6 @@
 answer, or none that could be computed: `SolutionStatus` names them, and every number of such a solution is NaN.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -178,9 +177,7 @@ def solve(
             ' jax.config.update("jax_enable_x64", True), and give float64 numbers'
         )
     if not switched:
-        adaptive = isinstance(method, AdaptiveStepping)
-        lean = {"keeps_mode": False, "stable": False} if adaptive else {"kinks": False}
-        method = dataclasses.replace(method, watches=False, smooth=True, follows=False, **lean)
+        method = method.without_switches()
     saves = {} if save_objective is None else {"saves": save_objective}
 
     room = count if isinstance(method, FixedStepping) else log_capacity(system, any_solver)

@@ -5,7 +5,6 @@ If a step crosses the stop or the event of a block, shorter steps are attempted 
 place of the crossing in the step.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from functools import partial
 
@@ -23,7 +22,6 @@ from diffabs.engine.drive.engine import default_engine
 from diffabs.engine.drive.loops import round_up_capacity
 from diffabs.engine.drive.runs import RunPlan, run_differentiable
 from diffabs.engine.solvers import Adaptive, Solver
-from diffabs.engine.step.adaptive import AdaptiveStepping
 from diffabs.engine.step.replay import log_capacity
 from diffabs.loop.arguments import prepare_arguments, refuse_values
 from diffabs.loop.closed_loop import Loop
@@ -151,8 +149,6 @@ def run_unchecked(
     count = -(-steps // every) if every else 0
     between = min(every, steps) if every else round_up_capacity(steps)
     room = round_up_capacity(log_capacity(loop, solver)) if isinstance(solver, Adaptive) else between
-    if every and isinstance(method, AdaptiveStepping):
-        method = dataclasses.replace(method, keeps_last_step=True)
     plan = RunPlan(finish_run, observe, room, round_up_capacity(count) if every else 0, every)
     # Capacities are static and rounded up, so that similar durations share one compiled program.
     arguments = loop, objectives, method, key

@@ -291,8 +291,8 @@ def clockwork(rate: Any, place: Any) -> Loop:
 )
 @killed_by(
     "engine.step.fixed",
-    "dataclasses.replace(self, kinks=self.kinks is not False,",
-    "dataclasses.replace(self, kinks=False,",
+    "dataclasses.replace(self._resolve(KEPT_MODES), second_order=True)",
+    "dataclasses.replace(self._resolve(FREE_MODES), second_order=True)",
     case="a jump",
 )
 @pytest.mark.parametrize("name", CLOSED)
@@ -345,9 +345,9 @@ def test_a_step_ends_on_a_comparison_near_the_start():
 
 @pytest.mark.slow
 @killed_by(
-    "engine.step.fixed",
-    "gave_up &= decision.searches & (after.search.number < system.bit_count)",
-    "gave_up &= False",
+    "engine.step.switching",
+    "decision.searches & (after.search.number < system.bit_count)",
+    "False",
 )
 def test_a_run_that_slides_along_a_kink_is_a_run():
     """x' = -sign(x - a) + 0.3: nobody can follow each switch; it stays within a step of the place, and says so."""
@@ -367,7 +367,7 @@ def test_a_run_that_slides_along_a_kink_is_a_run():
 @pytest.mark.slow
 @killed_by(
     "engine.step.fixed",
-    "valid &= carry.unrestricted | request.mode.slides | _is_plausible(carry, attempt) if system.program else True",
+    "valid &= carry.unrestricted | request.mode.slides | _is_plausible(carry, attempt)",
     "pass",
 )
 def test_where_a_step_is_too_long_a_regime_is_not_believed():
@@ -424,7 +424,7 @@ def integrating(late: float) -> tuple[Loop, float]:
     return Loop(**{**vars(loop), **parts}), most**2 * leaves + square(END - late) - square(leaves)
 
 
-@killed_by("engine.step.fixed", "hybrid.jumps if self.kinks is None", "False if self.kinks is None")
+@killed_by("engine.step.fixed", "KEPT_MODES if hybrid.jumps else FREE_MODES", "FREE_MODES")
 @pytest.mark.parametrize("late", [0.0, pytest.param(0.0337, marks=pytest.mark.slow)])
 def test_where_a_rate_jumps_a_value_is_right_too(late):
     """An integral that waits for a limit starts at once when the limit is left: in the middle of a step of 10 ms, which

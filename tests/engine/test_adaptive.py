@@ -221,8 +221,8 @@ def on_limits(solver):
 
 @killed_by(
     "engine.step.adaptive",
-    "surface = find_surface_crossing(dynamics, carry.search.number, h) if self.keeps_mode else None",
-    "surface = None",
+    "KEPT_MODES if self.switches == FREE_MODES else self.switches",
+    "self.switches",
 )
 @pytest.mark.slow
 def test_derivatives_on_limits_agree_with_differences():

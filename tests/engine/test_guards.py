@@ -34,7 +34,12 @@ def solve(field, engine="xla"):
 
 
 @pytest.mark.slow
-@killed_by("engine.step.adaptive", "(carry.length <= self.closest) & ~carry.unrestricted", "False", case="max-xla")
+@killed_by(
+    "engine.step.adaptive",
+    "stuck = jnp.logical_and(new, ~decision.valid) & (carry.length <= self.closest)",
+    "pass",
+    case="max-xla",
+)
 @killed_by("engine.step.adaptive", "(carry.status == RunStatus.REFRESHING) | carry.unrestricted", "False")
 @pytest.mark.parametrize("engine", ["xla", "kernel"])
 @pytest.mark.parametrize("name", GUARDS)
@@ -72,7 +77,7 @@ def test_an_empty_tank_fills_again():
 
 
 @pytest.mark.slow
-@killed_by("engine.step.adaptive", "carry.unrestricted & is_surface_moving(dynamics.surfaces, changed)", "False")
+@killed_by("engine.step.switching", "carry.unrestricted & is_surface_moving(dynamics.surfaces, changed)", "False")
 def test_a_level_that_may_fall_on_is_reported():
     """With sqrt(|h|) both 0 and -(rate t/2 - 1)^2 are solutions beyond the end."""
     found = jax.vmap(solve(lambda t, h, rate: -rate * jnp.sqrt(jnp.abs(h))))(RATES)

@@ -58,7 +58,7 @@ def test_standstill_of_a_locked_wheel_in_closed_form(step):
 
 
 @pytest.mark.slow
-@killed_by("engine.step.advance", "(running & exact & ~crosses))", "(running & exact))")
+@killed_by("engine.step.switching", "(running & exact & ~crosses))", "(running & exact))")
 def test_speed_reached_lands_between_samples():
     loop = dataclasses.replace(SLIDING, stop=SpeedReached(speed=3.0))
     run = d.rollout(loop, d.FixedStep(0.01, 2.0), {"effort": Effort(), "variation": Variation()})

@@ -262,7 +262,7 @@ def test_a_slide_is_reported(solver):
 
 
 @pytest.mark.slow
-@killed_by("engine.step.adaptive", "jnp.where(resolved, margin_error(system, carry, h, dynamics, state), 0.0)", "0.0")
+@killed_by("engine.step.switching", "jnp.where(resolved, margin_error(system, carry, h, dynamics, state), 0.0)", "0.0")
 def test_a_touch_is_reported_and_a_short_crossing_is_found():
     def final(level):
         return d.solve(
@@ -514,7 +514,7 @@ def test_a_kernel_solves_a_batch():
     assert jax.grad(final)(0.5) == pytest.approx(-1.0, abs=1e-8)
 
 
-@killed_by("engine.step.advance", "none, UNCONSTRAINED, accepted & last)", "none, UNCONSTRAINED, accepted)")
+@killed_by("engine.step.switching", "none, UNCONSTRAINED, accepted & last)", "none, UNCONSTRAINED, accepted)")
 @killed_by("engine.step.fixed", "self.h, strike * self.h, self.h", "self.h, carry.k * self.h, self.h")
 def test_fixed_steps_of_a_smooth_field_are_rk4():
     """Values of RK4 by NumPy, backwards in time; where they overflow, the solution has diverged."""
@@ -535,7 +535,7 @@ def test_fixed_steps_of_a_smooth_field_are_rk4():
     assert found.status.tolist() == [SolutionStatus.FINISHED, SolutionStatus.DIVERGED]
 
 
-@killed_by("engine.step.fixed", "end.rates[0] if self.smooth else ()", "()")
+@killed_by("engine.step.fixed", "end.rates[0] if self.switches == UNSWITCHED else ()", "()")
 @killed_by("engine.solve", 'system.inputs["t1"], system.time(point.t)', "system.time(point.t), system.time(point.t)")
 def test_the_last_fixed_step_ends_at_t1_within_the_domain():
     def field(t, y, args):
@@ -551,8 +551,8 @@ def test_the_last_fixed_step_ends_at_t1_within_the_domain():
 
 
 @pytest.mark.slow
-@killed_by("engine.step.advance", "stepping.second_order or not stepping.smooth", "not stepping.smooth")
-@killed_by("engine.step.adaptive", "not self.smooth, stable=True", "not self.smooth")
+@killed_by("engine.step.advance", "stepping.second_order or stepping.switches.isolates", "stepping.switches.isolates")
+@killed_by("engine.step.adaptive", "switches=switches, stable=True", "switches=switches")
 @killed_by("engine.step.replay", "entry.refresh | ~entry.accepted, 0.0", "entry.refresh, 0.0")
 def test_reverse_mode_where_rates_end_or_vanish():
     """Beyond t1, at rest, and in attempts that were rejected, numbers are not finite, or grow."""
@@ -569,7 +569,7 @@ def test_reverse_mode_where_rates_end_or_vanish():
     np.testing.assert_allclose(jax.vmap(jax.grad(drains))(rates), rates / 2 - 1, atol=1e-3)
 
 
-@killed_by("engine.solve", "watches=False, smooth=True", "watches=False, smooth=False")
+@killed_by("engine.step.fixed", "replace(self, switches=UNSWITCHED)", "replace(self, switches=FREE_MODES)")
 def test_a_smooth_field_pays_for_no_event():
     def lorenz(t, y, rho):
         a, b, c = y

@@ -150,7 +150,7 @@ STIFFNESSES = np.linspace(0.3, 2.5, 12)
 
 
 @killed_by(
-    "engine.step.adaptive",
+    "engine.step.switching",
     "dynamics.surfaces, changed, h), turns.time_since)",
     "dynamics.surfaces, changed, h), 0.0)",
 )

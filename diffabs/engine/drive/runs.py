@@ -6,7 +6,6 @@
 What becomes of the last state is the client's: `RunPlan.finish` and `RunPlan.observe`.
 """
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -34,11 +33,12 @@ from diffabs.engine.drive.loops import (
 )
 from diffabs.engine.hybrid import Finish, HybridSystem, Objectives, Observe
 from diffabs.engine.solvers import Adaptive, Solver
-from diffabs.engine.step.adaptive import AdaptiveStepping, clip_rtol
+from diffabs.engine.step.adaptive import AdaptiveStepping, clip_rtol, keep_steps
 from diffabs.engine.step.fixed import FixedStepping
 from diffabs.engine.step.replay import ReplayStepping, log_attempt, log_capacity, refuse_derivative, states_between
 from diffabs.engine.step.slides import has_slid, slide_of
 from diffabs.engine.step.status import end_unfinished
+from diffabs.engine.step.switching import FREE_MODES, KEPT_MODES, KeptModes
 
 
 class RunPlan(NamedTuple):
@@ -69,8 +69,10 @@ def build_stepping(solver: Solver, dtype: DTypeLike) -> FixedStepping | Adaptive
     h, steps = number(float(solver.step), dtype), jax.device_put(solver.steps)
     if isinstance(solver, Adaptive):
         rtol = number(float(clip_rtol(np.asarray(solver.rtol, dtype))), dtype)
-        return AdaptiveStepping(h, steps, rtol, keeps_mode=solver.follow_slides, follows=solver.follow_slides)
-    return FixedStepping(h, steps, True if solver.follow_slides else solver.kinks, follows=solver.follow_slides)
+        return AdaptiveStepping(h, steps, rtol, KeptModes(follows=True) if solver.follow_slides else FREE_MODES)
+    if solver.follow_slides:
+        return FixedStepping(h, steps, KeptModes(follows=True))
+    return FixedStepping(h, steps, {True: KEPT_MODES, False: FREE_MODES, None: None}[solver.kinks])
 
 
 def run_system(
@@ -147,7 +149,7 @@ def _run(
     carry, renew, instants = method.start(hybrid, objectives, key), partial(method.renew, hybrid), plan.instants
     if not instants:
         return plan.finish(hybrid, objectives, run_to_end(stepped, renew, carry))[0]
-    look, count = _observer(hybrid, method, plan), -(-method.steps // every)
+    look, count, carry = _observer(hybrid, method, plan), -(-method.steps // every), method.keep_steps(carry)
     first = look(carry, 0)
     carry, trajectory = run_with_trajectory(stepped, renew, method.is_active, look, carry, every, count, instants)
     return _attach_trajectory(plan.finish(hybrid, objectives, carry), first, trajectory)
@@ -191,18 +193,18 @@ def _run_by_replay(
     objectives, (finish, observe, room, instants, every) = {**objectives, **further}, plan
     # The log holds values only: derivatives come from the replay.
     still, measures = jax.tree.map(jax.lax.stop_gradient, (hybrid, objectives))
-    logged = dataclasses.replace(live, keeps_last_step=False)
     carry, log = log_run(
-        partial(logged.step, still, measures, key),
-        partial(logged.renew, still),
+        partial(live.step, still, measures, key),
+        partial(live.renew, still),
         log_attempt,
-        logged.start(still, measures, key),
+        live.start(still, measures, key),
         room,
     )
     log = jax.lax.stop_gradient(log)
     status = end_unfinished(carry).status
     replay = ReplayStepping(live)
     start = replay.start(hybrid, objectives, key)
+    start = keep_steps(start) if every else start
     again, spans = replay_log(
         partial(replay.step, hybrid, objectives, key),
         lambda carry: carry.control.last_step,

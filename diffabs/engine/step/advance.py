@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from diffabs.core.lanes import any_lane, jit_barrier, keep_decision, select
+from diffabs.core.lanes import jit_barrier, keep_decision, select
 from diffabs.core.log import borrow, log_rows, write_last_rows
 from diffabs.core.protocols import Clock
 from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
@@ -29,33 +29,23 @@ from diffabs.engine.step.attempt import (
     attempt_step,
     commit_step,
     evaluate_point,
-    flip_answers,
-    mode_after_changes,
-    mode_in_step,
     start_state,
 )
 from diffabs.engine.step.event_location import (
     EventSearch,
-    SearchPlan,
-    continue_search,
-    falls_through,
-    find_crossings,
     init_search,
 )
-from diffabs.engine.step.modes import Mode, single_bit
+from diffabs.engine.step.modes import Mode
 from diffabs.engine.step.runge_kutta import Tableau
 from diffabs.engine.step.slides import (
     Landing,
     SlideWatch,
     along_of,
     begins_along,
-    decided_answers,
-    init_watch,
     lose_mode,
     watch_landing,
 )
-from diffabs.engine.step.sliding_flow import MAX_SURFACES
-from diffabs.engine.step.status import RunStatus, is_running, status_after_step
+from diffabs.engine.step.status import RunStatus, is_running
 from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, Objectives, ObservedSystem, build_system
 
 
@@ -117,6 +107,15 @@ class Decision(NamedTuple):
     over: Bool
 
 
+class Judged(NamedTuple):
+    """An attempt from a run in a system, with the decision on it."""
+
+    system: ObservedSystem
+    carry: Carry
+    attempt: Attempt
+    decision: Decision
+
+
 class Stepping(Protocol):
     """A stepping method: what `advance` needs of it."""
 
@@ -136,18 +135,13 @@ class Stepping(Protocol):
         ...
 
     @property
-    def searches(self) -> bool:
-        """True if the method locates events; False if a log says where they are, or there are none."""
+    def switches(self) -> Any:
+        """What it does about switches, a rule of `switching`."""
         ...
 
     @property
-    def smooth(self) -> bool:
-        """True if nothing switches and no event can happen."""
-        ...
-
-    @property
-    def follows(self) -> bool:
-        """True if a run follows the surface along which it slides."""
+    def shows_comparisons(self) -> bool:
+        """True if the comparisons of the flow are visible."""
         ...
 
     @property
@@ -157,10 +151,6 @@ class Stepping(Protocol):
 
     def is_active(self, carry: Carry, until: Int | None) -> Bool:
         """Return True if the run of `carry` goes on and has not reached the instant `until` of the grid."""
-        ...
-
-    def is_switched(self, hybrid: HybridSystem) -> bool:
-        """Return True if the comparisons of the `hybrid`'s flow are visible."""
         ...
 
     def is_calm(self, carry: Carry) -> Bool:
@@ -203,7 +193,7 @@ class Stepping(Protocol):
         """Return the carry `after` an `attempt` with length and status of the next attempt.
 
         `carry` is the run in `system` before the attempt, and `decision` the decision on it. `after` has the new point
-        and, from a method that `searches` or is `smooth`, the status; if it `searches`, also the search and its length.
+        what `Replayed.conclude` adds: from a method with switches the status, the search and its length.
         """
         ...
 
@@ -228,7 +218,7 @@ def advance(
     carry = carry._replace(point=start)
     system = build_system(
         *(hybrid, objectives, start.t, start.state, start.accumulators),
-        switched=stepping.is_switched(hybrid),
+        switched=stepping.shows_comparisons,
         has_margin_rates=stepping.has_margin_rates,
     )
     request, forecast = stepping.propose(system, carry), partial(stepping.forecast, carry)
@@ -240,7 +230,7 @@ def advance(
     # Without the barriers, XLA would compile the attempt again into each expression that uses it. A step in which
     # nothing is searched has few such expressions. For derivatives the barrier also skips attempts beyond the end,
     # where reverse mode would multiply 0 by a rate that may be infinite.
-    barrier = jit_barrier if stepping.second_order or not stepping.smooth else lambda active, work: work()
+    barrier = jit_barrier if stepping.second_order or stepping.switches.isolates else lambda active, work: work()
     attempt = barrier(active, attempt_request)
     decision = keep_decision(barrier(active, lambda: stepping.decide(system, carry, request, attempt, active)))
 
@@ -264,10 +254,8 @@ def advance(
     point = select(decision.accepted, point, start)
     since = jnp.where(strikes, 0.0, jnp.where(decision.accepted, carry.since + request.h, carry.since))
     after = carry._replace(point=point, k=k, since=since, slides=slides)
-    if stepping.searches:
-        after = _search(stepping, system, carry, attempt, decision, after)
-    elif stepping.smooth:
-        after = after._replace(status=_next_status(system, carry, attempt, decision, carry.status))
+    judged = Judged(system, carry, attempt, decision)
+    after = stepping.switches.conclude(judged, after, refines=stepping.second_order)
     after = stepping.plan_next(system, carry, attempt, decision, after)
     if along_of(after):
         gives_up = jnp.logical_and(decision.valid, ~carry.unrestricted)
@@ -294,31 +282,6 @@ def _watch_slides(
     return watch_landing(carry.slides, Landing(carry.search, words, landed, calm, reset, t))
 
 
-def _search(
-    stepping: Stepping, system: ObservedSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
-) -> Carry:
-    """Return the carry `after` an attempt with the search for an event continued, and with the next status."""
-    plan = SearchPlan(carry.search, carry.length, carry.status)
-
-    def next_plan() -> SearchPlan:
-        margins = (jax.tree.leaves(point.margins) for point in (carry.point, attempt.point))
-        crossings = find_crossings(carry.search.number, system.bit_count, attempt.report.surface, *margins)
-        next_search = continue_search(plan, crossings, carry.base, system.bit_count, refines=stepping.second_order)
-        return select(decision.searches, next_search, plan)
-
-    # Few attempts search, so a batch skips the search unless one of its runs needs it.
-    search, length, status = jax.lax.cond(any_lane(decision.searches), next_plan, lambda: plan)
-    number, located, at_once = keep_decision((search.number, search.located, search.at_once))
-    search = search._replace(number=number, located=located, at_once=at_once)
-    status = _next_status(system, carry, attempt, decision, status)
-    return after._replace(search=search, length=length, status=status)
-
-
-def _next_status(system: ObservedSystem, carry: Carry, attempt: Attempt, decision: Decision, status: Scalar) -> Scalar:
-    """Return the status after an attempt; `status` where it was not accepted."""
-    return jnp.where(decision.accepted, status_after_step(system.hybrid, carry, attempt, decision), status)
-
-
 def start_carry(
     stepping: Stepping,
     hybrid: HybridSystem,
@@ -336,88 +299,15 @@ def start_carry(
     logs, state = log_rows(state), borrow(state, None)
     system = build_system(
         *(hybrid, objectives, none, state, accumulators),
-        switched=stepping.is_switched(hybrid),
+        switched=stepping.shows_comparisons,
         has_margin_rates=stepping.has_margin_rates,
     )
     point = evaluate_point(system, none, state, accumulators, UNCONSTRAINED, forecast)
     status = jnp.where(point.margins["stop"][0] > 0, zero + RunStatus.RUNNING, zero + RunStatus.MISSED)
     point = point._replace(state=borrow(state, logs))
     search, yes, no = init_search(stepping.h), jnp.asarray(True), jnp.asarray(False)
-    slides = ()
-    if system.bit_count and stepping.searches:
-        surfaces = min(system.bit_count, MAX_SURFACES) if stepping.follows else 0
-        slides = init_watch(system.word_count, surfaces, none)
+    slides = stepping.switches.start_watch(system, none)
     return Carry(point, zero, none, stepping.h, yes, stepping.h, search, no, slides, (), status)
-
-
-def propose_step(stepping: Stepping, system: ObservedSystem, carry: Carry, strike: Int, *, frozen: bool) -> StepRequest:
-    """Return the step to attempt next, which keeps to a mode if `frozen`.
-
-    `strike` is the number of the next instant at which a clock strikes, or the run ends.
-    """
-    refresh, mode = carry.status == RunStatus.REFRESHING, UNCONSTRAINED
-    if frozen:
-        words = carry.point.words
-        beyond = mode_after_changes(
-            words, decided_answers(carry, system.word_count), carry.search.number < system.bit_count
-        )
-        mode = select(refresh, beyond, mode_in_step(system, words, carry.unrestricted))
-        mode = mode._replace(along=along_of(carry))
-    end = jnp.where(carry.strikes, strike * stepping.h, carry.point.t + carry.length)
-    return StepRequest(carry.length, end, stepping.h, mode, refresh, carry.strikes, strike)
-
-
-def decide_attempt(
-    stepping: Stepping,
-    system: ObservedSystem,
-    carry: Carry,
-    attempt: Attempt,
-    active: Bool,
-    valid: Bool,
-    exact: Bool,
-    *,
-    last: Bool,
-    frozen: bool,
-) -> Decision:
-    """Return the decision on an attempt: accept it, search within it, or end the run.
-
-    `valid` says that its numbers are finite and plausible, and `exact` that it is accurate enough, too, or cannot be
-    made shorter. The run ends with the `last` attempt. A `frozen` step keeps to a mode.
-    """
-    if stepping.smooth:
-        no, accepted = jnp.asarray(False), active & valid & exact
-        none = jax.tree.map(lambda margin: no, attempt.point.margins)
-        return Decision(valid, accepted, no, no, none, UNCONSTRAINED, accepted & last)
-    running, landing, refreshing = (
-        carry.status == status for status in (RunStatus.RUNNING, RunStatus.LANDING, RunStatus.REFRESHING)
-    )
-    surface, bit_count, number = attempt.report.surface, system.bit_count, carry.search.number
-    crossed = falls_through(jax.tree.leaves(carry.point.margins), jax.tree.leaves(attempt.point.margins))
-    crosses = [*crossed, *([] if surface is None else [surface.contradicted, surface.unsought >= 0])]
-    crosses = jnp.any(jnp.stack(crosses))
-    accepted = active & valid & (landing | refreshing | (running & exact & ~crosses))
-    searches = active & ~landing & ~refreshing & (~running | (exact & crosses))
-    triggered = [accepted & landing & ((number == bit_count + i) | falls) for i, falls in enumerate(crossed)]
-    triggered = jax.tree.unflatten(jax.tree.structure(attempt.point.margins), triggered)
-    over = reduce(jnp.logical_or, triggered["stop"]) | (accepted & last)
-    lands, mode = jnp.asarray(False), UNCONSTRAINED
-    if frozen:
-        lands = accepted & landing & (number < bit_count)
-        # A slide ends with the answer of the side whose share has become 1.
-        along = along_of(carry)
-        decided = flips = single_bit(number, system.word_count)
-        for surface, share in zip(along, attempt.shares, strict=True):
-            ends, none = surface.number == number, tuple(jnp.zeros_like(word) for word in flips)
-            flips = select(ends, select(share > 0.5, surface.answers, none), flips)
-            decided = select(ends, surface.answers, decided)
-        mode = mode_after_changes(flip_answers(attempt.point.words, flips, lands), decided, lands)
-    return Decision(valid, accepted, searches, lands, triggered, mode, over)
-
-
-def have_same_answers(carry: Carry, attempt: Attempt) -> Bool:
-    """Return True if the comparisons have the same answers at both ends of an attempt."""
-    pairs = zip(attempt.point.words, carry.point.words, strict=True)
-    return jnp.all(jnp.array([a == b for a, b in pairs], bool))
 
 
 def cast_floats(tree: object, dtype: DTypeLike) -> PyTree:

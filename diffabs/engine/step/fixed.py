@@ -10,29 +10,21 @@ accurate to the order of the kink. Later steps are unrestricted, too, until no c
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState, HybridSystem
-from diffabs.engine.step.advance import (
-    Carry,
-    Decision,
-    advance,
-    cast_floats,
-    decide_attempt,
-    have_same_answers,
-    propose_step,
-    start_carry,
-)
+from diffabs.engine.step.advance import Carry, Decision, Judged, advance, cast_floats, start_carry
 from diffabs.engine.step.attempt import Attempt, StepRequest
-from diffabs.engine.step.event_location import MAX_LOCATION_ATTEMPTS, SurfaceCrossing, find_surface_crossing
-from diffabs.engine.step.outlook import look_ahead, watch_margins
+from diffabs.engine.step.modes import SurfaceCrossing
+from diffabs.engine.step.outlook import look_ahead
 from diffabs.engine.step.runge_kutta import RK4
 from diffabs.engine.step.slides import begin_slide, ended_slide
 from diffabs.engine.step.status import RunStatus
+from diffabs.engine.step.switching import FREE_MODES, KEPT_MODES, UNSWITCHED, Checks, ModeGuard, Strain, Unswitched
 from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, Objectives, ObservedSystem
 
 EVENT_ATTEMPTS_PER_STEP, SPARE_ATTEMPTS = 4, 64  # attempts to locate events: for each step of the grid, and in addition
@@ -61,8 +53,7 @@ class FixedStepReport(NamedTuple):
 
     Attributes:
         surface: Contradicted comparisons; None if switching surfaces are not located.
-        grazes: True if a margin crosses zero twice within the step, or only touches it; False unless the method
-            `watches`.
+        grazes: True if a margin crosses zero twice within the step, or only touches it, in a run that is watched.
     """
 
     surface: SurfaceCrossing | None
@@ -72,7 +63,7 @@ class FixedStepReport(NamedTuple):
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["h", "steps"],
-    meta_fields=["kinks", "second_order", "watches", "smooth", "follows"],
+    meta_fields=["switches", "second_order"],
 )
 @dataclasses.dataclass(frozen=True)
 class FixedStepping:
@@ -81,43 +72,54 @@ class FixedStepping:
     Attributes:
         h: Length of a step [s].
         steps: Number of steps.
-        kinks: True if switching surfaces are located. None locates them for derivatives, and if a rate jumps there.
+        switches: What they do about switches. None keeps modes for derivatives, and if a rate jumps at a surface.
         second_order: True if the times of events have second derivatives.
-        watches: True if the run ends where it slides or grazes. It must locate switching surfaces.
-        smooth: True if nothing switches and no event can happen. Then each attempt is a step to the next instant.
-        follows: True if a run follows the surface along which it slides.
     """
 
     h: Array
     steps: Int
-    kinks: bool | None = None
+    switches: Any = None
     second_order: bool = False
-    watches: bool = False
-    smooth: bool = False
-    follows: bool = False
     tableau = RK4
-    step = advance
-
-    @property
-    def searches(self) -> bool:
-        """True if the method locates events."""
-        return not self.smooth
 
     @property
     def has_margin_rates(self) -> bool:
         """True if the rates of all margins are evaluated."""
-        return self.watches
+        return self.switches.watches
+
+    @property
+    def shows_comparisons(self) -> bool:
+        """True if the comparisons of the flow are visible."""
+        return self.switches.keeps_mode
 
     @property
     def crossing_attempts(self) -> int:
         """Attempts on switching surfaces per step of the grid; beyond, steps are unrestricted."""
-        return FOLLOWED_ATTEMPTS_PER_STEP if self.follows else CROSSING_ATTEMPTS_PER_STEP
+        return FOLLOWED_ATTEMPTS_PER_STEP if self.switches.follows else CROSSING_ATTEMPTS_PER_STEP
+
+    def _for_values(self, hybrid: HybridSystem) -> "FixedStepping":
+        """Return the method for the values of `hybrid`."""
+        return self._resolve(KEPT_MODES if hybrid.jumps else FREE_MODES)
+
+    def _resolve(self, switches: Unswitched) -> "FixedStepping":
+        return self if self.switches else dataclasses.replace(self, switches=switches)
 
     def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `hybrid`, `objectives` and random `key`."""
-        foresee = partial(look_ahead, jnp.asarray(True), -1) if self.watches else lambda dynamics: ()
-        carry = start_carry(self, hybrid, objectives, key, foresee)
+        method = self._for_values(hybrid)
+        foresee = partial(method._look_ahead, jnp.asarray(True), -1)
+        carry = start_carry(method, hybrid, objectives, key, foresee)
         return cast_floats(carry._replace(control=FixedStepControl(carry.k, carry.k)), self.h.dtype)
+
+    def step(
+        self, hybrid: HybridSystem, objectives: Objectives, key: Key | None, carry: Carry, until: Int | None = None
+    ) -> Carry:
+        """Return the `carry` after one attempt, as `advance` says."""
+        return advance(self._for_values(hybrid), hybrid, objectives, key, carry, until)
+
+    def keep_steps(self, carry: Carry) -> Carry:
+        """Return the `carry` unchanged: steps end on the instants of the grid."""
+        return carry
 
     def renew(self, hybrid: HybridSystem, carry: Carry) -> Carry:
         """Return the `carry` unchanged: fixed steps of a `hybrid` need no update between blocks."""
@@ -134,23 +136,23 @@ class FixedStepping:
         return carry.point.t, carry.point.state, carry.running
 
     def for_derivatives(self) -> "FixedStepping":
-        """Return the method for derivatives of both orders: it locates switching surfaces unless `kinks` is False."""
-        return dataclasses.replace(self, kinks=self.kinks is not False, second_order=True)
+        """Return the method for derivatives of both orders."""
+        return dataclasses.replace(self._resolve(KEPT_MODES), second_order=True)
+
+    def without_switches(self) -> "FixedStepping":
+        """Return the method for a field without comparisons and events."""
+        return dataclasses.replace(self, switches=UNSWITCHED)
 
     def capacity(self, hybrid: HybridSystem, steps: int) -> int:
         """Return the capacity of a scan for this number of `steps`: the greatest usual number of attempts.
 
         An event takes at least four attempts. One of them is REFINING, which `FixedStepControl.extra` does not count.
         """
-        if self.smooth:
+        if self.switches == UNSWITCHED:
             return steps
-        crossings = self.crossing_attempts if self.kinks is not False else 0
+        crossings = self.crossing_attempts if self.switches.keeps_mode else 0
         about = (crossings + (EVENT_ATTEMPTS_PER_STEP if hybrid.eventful else 0)) * steps + SPARE_ATTEMPTS
         return steps + SPARE_ATTEMPTS + about + about // 3
-
-    def is_switched(self, hybrid: HybridSystem) -> bool:
-        """Return True if the comparisons of the `hybrid`'s flow are visible."""
-        return hybrid.jumps if self.kinks is None else self.kinks
 
     def is_calm(self, carry: Carry) -> Bool:
         """Return True if the attempt of `carry` is no short rest of a step."""
@@ -159,25 +161,23 @@ class FixedStepping:
     def propose(self, system: ObservedSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
         strike = carry.k + 1
-        if self.smooth:
+        if self.switches == UNSWITCHED:  # each attempt goes to the next instant
             no, yes = jnp.asarray(False), jnp.asarray(True)
             return StepRequest(self.h, strike * self.h, self.h, UNCONSTRAINED, no, yes, strike)
-        return propose_step(self, system, carry, strike, frozen=system.program is not None)
+        return self.switches.propose(system, carry, self.h, strike)
 
     def forecast(self, carry: Carry, dynamics: Evaluation) -> PyTree:
-        """Return the `Outlook` if the method `watches`, and else nothing."""
-        if not self.watches:
-            return ()
-        return look_ahead(carry.status == RunStatus.REFRESHING, ended_slide(carry), dynamics)
+        """Return the `Outlook` of a method that watches all margins, and else nothing."""
+        return self._look_ahead(carry.status == RunStatus.REFRESHING, ended_slide(carry), dynamics)
 
     def report(
         self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: HybridState, error: object
     ) -> FixedStepReport:
         """Return the comparisons that an attempt contradicts at its end, and whether a margin grazes zero."""
         del state, error
-        surface, grazes = find_surface_crossing(dynamics, carry.search.number, h) if system.program else None, False
-        if self.watches:
-            turns = watch_margins(carry, h, dynamics, system.bit_count)
+        surface, grazes = self.switches.find_surface(carry, h, dynamics), False
+        if self.has_margin_rates:
+            turns = self.switches.find_turns(system, carry, h, dynamics)
             grazes = turns.grazes | (turns.time_since > 0)
         return FixedStepReport(surface, jnp.asarray(grazes))
 
@@ -187,45 +187,31 @@ class FixedStepping:
         """Return the decision: the numbers must be finite and, within a mode, plausible."""
         end = attempt.point
         # The rates at the end of a smooth run are used nowhere else but in samples of its last step.
-        numbers = jax.tree.leaves((end.state.flow(), end.rates[0] if self.smooth else ()))
+        numbers = jax.tree.leaves((end.state.flow(), end.rates[0] if self.switches == UNSWITCHED else ()))
         valid = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in numbers]))
-        # A run that slides is moved onto its surface, which no rate predicts.
-        valid &= carry.unrestricted | request.mode.slides | _is_plausible(carry, attempt) if system.program else True
+        if self.switches.keeps_mode:  # a run that slides is moved onto its surface, which no rate predicts
+            valid &= carry.unrestricted | request.mode.slides | _is_plausible(carry, attempt)
         last = request.strikes & (request.strike >= self.steps)
-        frozen = system.program is not None
-        return decide_attempt(self, system, carry, attempt, active, valid, valid, last=last, frozen=frozen)
+        return self.switches.decide(system, carry, attempt, Checks(active, valid, valid, last))
 
     def plan_next(
         self, system: ObservedSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
     ) -> Carry:
         """Return `after` with length and status of the next attempt, which goes to the grid or continues the search."""
-        if self.smooth:
+        if self.switches == UNSWITCHED:
             return after._replace(status=jnp.where(decision.valid, after.status, RunStatus.DIVERGED))
         control, on_grid = carry.control, decision.accepted & carry.strikes
         extra = control.extra + jnp.where(on_grid | (carry.status == RunStatus.REFINING), 0, 1)
         in_step = jnp.where(on_grid, 0, control.in_step + extra - control.extra)
-        unrestricted, status = carry.unrestricted, after.status
-        if system.program:
-            crowded = control.in_step >= self.crossing_attempts * MAX_ATTEMPTS_PER_STEP
-            gave_up = (
-                crowded
-                | (after.search.tries >= MAX_LOCATION_ATTEMPTS)
-                | (control.extra > self.crossing_attempts * carry.k + SPARE_ATTEMPTS)
-            )
-            gave_up &= decision.searches & (after.search.number < system.bit_count)
-            if watch := after.slides:
-                # So many landings within one step that there is no room for another return.
-                begins = gave_up & crowded & (watch.returns > 0)
-                slide = begin_slide(watch.lost, begins, after.search.number, after.point.t)
-                after = after._replace(slides=watch._replace(lost=slide))
-            becomes_unrestricted = ~decision.accepted & ~unrestricted & (~decision.valid | gave_up)
-            unrestricted = (unrestricted | becomes_unrestricted) & ~(on_grid & have_same_answers(carry, attempt))
-            status = jnp.where(becomes_unrestricted, RunStatus.RUNNING, status)
+        status, unrestricted, lost = after.status, carry.unrestricted, ~decision.valid
+        if self.switches.keeps_mode:
+            after, guard = self._guard_mode(Judged(system, carry, attempt, decision), after, calm=on_grid)
+            status = jnp.where(guard.abandons, RunStatus.RUNNING, status)
+            unrestricted, lost = guard.unrestricted, lost & carry.unrestricted
+            if self.switches.watches:
+                grazes = attempt.report.grazes & (decision.accepted | decision.searches)
+                status = self.switches.judge(status, guard.slides, grazes, after)
         max_extra = (EVENT_ATTEMPTS_PER_STEP + self.crossing_attempts) * self.steps + SPARE_ATTEMPTS
-        lost = ~decision.valid & (carry.unrestricted if system.program else True)
-        if self.watches:
-            grazes = attempt.report.grazes & (decision.accepted | decision.searches)
-            status = jnp.where(unrestricted, RunStatus.SLID, jnp.where(grazes, RunStatus.GRAZED, status))
         status = jnp.where(extra > max_extra, RunStatus.EXHAUSTED, status)
         strikes = status == RunStatus.RUNNING
         length = jnp.where(strikes, self.h - after.since, jnp.where(status == RunStatus.REFRESHING, 0.0, after.length))
@@ -236,6 +222,28 @@ class FixedStepping:
             control=FixedStepControl(extra, in_step),
             status=jnp.where(lost, RunStatus.DIVERGED, status),
         )
+
+    def _guard_mode(self, judged: Judged, after: Carry, *, calm: Bool) -> tuple[Carry, ModeGuard]:
+        """Return the carry `after` an attempt with the slide that it has lost, and what becomes of its mode."""
+        _, carry, _, decision = judged
+        control = carry.control
+        crowded = control.in_step >= self.crossing_attempts * MAX_ATTEMPTS_PER_STEP
+        strain = Strain(
+            crowded=crowded | (control.extra > self.crossing_attempts * carry.k + SPARE_ATTEMPTS),
+            leaves=jnp.logical_not(decision.valid),
+            calm=calm,
+            stuck=False,
+        )
+        guard = self.switches.guard(judged, after, strain)
+        if watch := after.slides:
+            # So many landings within one step that there is no room for another return.
+            begins = guard.fails & crowded & (watch.returns > 0)
+            slide = begin_slide(watch.lost, begins, after.search.number, after.point.t)
+            after = after._replace(slides=watch._replace(lost=slide))
+        return after, guard
+
+    def _look_ahead(self, fresh: Bool, ended: Int, dynamics: Evaluation) -> PyTree:
+        return look_ahead(fresh, ended, dynamics) if self.has_margin_rates else ()
 
 
 def _is_plausible(carry: Carry, attempt: Attempt) -> Bool:

@@ -26,13 +26,14 @@ from diffabs.core.lanes import any_lane, select
 from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState, HybridSystem
 from diffabs.engine.solvers import ADAPTIVE_ERROR_ORDER, Adaptive
-from diffabs.engine.step.adaptive import AdaptiveStepping, StateSpan, clip_rtol, span_step
+from diffabs.engine.step.adaptive import AdaptiveStepping, StateSpan, clip_rtol, next_span
 from diffabs.engine.step.advance import Carry, Decision, advance, cast_floats, start_carry
 from diffabs.engine.step.attempt import Attempt, StepRequest, mode_in_step
 from diffabs.engine.step.modes import ModeBits, SlidingSurface, pick_number
 from diffabs.engine.step.runge_kutta import TSIT5
 from diffabs.engine.step.slides import along_of, is_return
 from diffabs.engine.step.status import RunStatus
+from diffabs.engine.step.switching import Replayed
 from diffabs.engine.step.system import Evaluation, Objectives, ObservedSystem
 
 T = TypeVar("T")
@@ -106,7 +107,8 @@ class ReplayStepping:
 
     live: AdaptiveStepping
     entry: Any = None
-    tableau, has_margin_rates, searches, smooth, second_order, follows = TSIT5, True, False, False, False, False
+    switches = Replayed()
+    tableau, has_margin_rates, shows_comparisons, second_order = TSIT5, True, True, False
 
     @property
     def h(self) -> Array:
@@ -116,8 +118,7 @@ class ReplayStepping:
     def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a replay at t = 0, from `hybrid`, `objectives` and random `key`."""
         carry = start_carry(self, hybrid, objectives, key)
-        last = span_step(carry.point, carry.point) if self.live.keeps_last_step else ()
-        control = ReplayControl(jnp.zeros_like(self.h), last)
+        control = ReplayControl(jnp.zeros_like(self.h), ())
         # A run whose start is over has no logged attempt.
         running = jnp.asarray(RunStatus.RUNNING.value)
         return cast_floats(carry._replace(control=control, search=(), status=running), self.h.dtype)
@@ -130,11 +131,6 @@ class ReplayStepping:
         """Return True if the logged attempt was accepted; `carry` and `until` have no influence."""
         del carry, until
         return self.entry.accepted
-
-    def is_switched(self, hybrid: HybridSystem) -> bool:
-        """Return True: the comparisons of the `hybrid`'s flow are always visible."""
-        del hybrid
-        return True
 
     def is_calm(self, carry: Carry) -> Bool:
         """Return True: a replay of `carry` looks for no slide."""
@@ -192,9 +188,7 @@ class ReplayStepping:
         """Return the carry `after` an `attempt` with the new delay behind the log."""
         delay, last = carry.control
         delay = jnp.where(decision.accepted & ~self.entry.refresh, attempt.shift, delay)
-        if self.live.keeps_last_step:
-            last = select(decision.accepted, span_step(carry.point, attempt.point), last)
-        return after._replace(control=ReplayControl(delay, last))
+        return after._replace(control=ReplayControl(delay, next_span(last, carry, attempt, decision)))
 
 
 class LaggedReplay(NamedTuple):

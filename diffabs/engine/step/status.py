@@ -29,8 +29,8 @@ class RunStatus(enum.IntEnum):
         EXHAUSTED: The run is over because its attempts are too many.
         MISSED: The run is over because its landing misses the stop, or its start is beyond the stop.
         REFUSED: The run was not accepted, and over from the beginning.
-        SLID: The run is over because it slides along a switching surface; only of a method that `watches`.
-        GRAZED: The run is over because a margin only touches zero; only of a method that `watches`.
+        SLID: The run is over because it slides along a switching surface; only with `WatchedModes`.
+        GRAZED: The run is over because a margin only touches zero; only with `WatchedModes`.
     """
 
     RUNNING, SEEKING, PROBING, REFINING, LANDING, REFRESHING, STOPPED, TIMED_OUT = range(8)
