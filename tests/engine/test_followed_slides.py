@@ -9,6 +9,7 @@ import sliding
 import test_slides
 from marks import cases
 from mutants import killed_by
+from scipy.optimize import brentq
 
 import diffabs as d
 from diffabs.core.pytree import get, replace
@@ -131,6 +132,63 @@ def test_random_fields_slide_along_two_surfaces():
     assert slides > 120
     assert both > 50
     assert refused <= 20
+
+
+def steer_to_the_line(t, y, p):
+    """Return the rates of a mass under sliding-mode control without a boundary layer: v' = -k sign(v + c x)."""
+    x, v = y
+    return v, -p["k"] * test_slides.sign(v + p["c"] * x)
+
+
+def exact_on_the_line(p, end):
+    """Return position and speed: constant acceleration from (1, 0) up to the line v = -c x, then x' = -c x."""
+    k, c = p["k"], p["c"]
+    lands = 1 / c * (np.sqrt(1 + 2 * c**2 / k) - 1)  # the line's root -k t + c (1 - k t^2/2) = 0
+    x = (1 - k * lands**2 / 2) * np.exp(-c * (end - lands))
+    return np.array([x, -c * x])
+
+
+def heat_by_relay(t, y, p):
+    """Return the rate of a temperature that a relay without a band holds on a rising target: y' = q (y < r) - y."""
+    return p["q"] * jnp.where(y < target_at(t), 1.0, 0.0) - y
+
+
+def target_at(t):
+    return 1.0 + 0.25 * t**2
+
+
+def exact_heat(p, end):
+    """Return the temperature: heating up to the target, along it, and below it once it rises faster than q permits."""
+    q = p["q"]
+    lands = brentq(lambda t: q * (1 - np.exp(-t)) - target_at(t), 0.0, 1.5)
+    leaves = -1 + np.sqrt(4 * (q - 1) + 1)  # r' + r = q, with r = 1 + t^2/4
+    assert lands < leaves < end
+    return q + (target_at(leaves) - q) * np.exp(leaves - end)
+
+
+CONTROLLED = {
+    "sliding mode": (steer_to_the_line, (1.0, 0.0), {"k": 2.0, "c": 1.5}, exact_on_the_line),
+    "relay on a rising target": (heat_by_relay, 0.0, {"q": 2.5}, exact_heat),
+}
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("name", cases(CONTROLLED, "sliding mode"))
+@killed_by("engine.step.sliding_flow", "ahead, bits = share * (1.0 - share),", "ahead, bits = share - share + 1.0,")
+def test_laws_that_switch_without_end_have_the_exact_derivatives(name, solver):
+    rates, y0, p, exact = CONTROLLED[name]
+
+    def end(p):
+        solution = d.solve(rates, y0, 0.0, END, p, solver=solver, engine="xla")
+        return jnp.stack(jax.tree.leaves(solution.y)), solution.status
+
+    slopes, status = jax.jit(jax.jacfwd(end, has_aux=True))(p)
+    assert status == SolutionStatus.FINISHED
+    np.testing.assert_allclose(jax.jit(end)(p)[0], np.atleast_1d(exact(p, END)), rtol=1e-7)
+    for parameter, number in p.items():
+        for width in (1e-3, 3e-4, 1e-4):
+            high, low = (exact({**p, parameter: number + move}, END) for move in (width, -width))
+            np.testing.assert_allclose(slopes[parameter], np.atleast_1d(high - low) / (2 * width), rtol=1e-5)
 
 
 def push_with_wave(t, y, p):
