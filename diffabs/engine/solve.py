@@ -26,10 +26,10 @@ from diffabs.engine.drive.runs import RunPlan, run_differentiable
 from diffabs.engine.field import COINCIDENCE_FRACTION, Event, Field, FieldSystem, Saves, SolutionStatus
 from diffabs.engine.solvers import Adaptive, Solver
 from diffabs.engine.step.adaptive import AdaptiveStepping
+from diffabs.engine.step.event_location import RunStatus, end_unfinished
 from diffabs.engine.step.fixed import FixedStepping
 from diffabs.engine.step.inner_functions import SEARCHSORTED
 from diffabs.engine.step.replay import log_attempt, log_capacity
-from diffabs.engine.step.status import RunStatus, end_unfinished
 from diffabs.engine.step.system import UNCONSTRAINED, build_system
 
 MAX_EVENTS = 24  # kinds of events of a solution: the log of a run has one bit for each

@@ -16,9 +16,8 @@ from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import canonical_dtypes, get, replace
 from diffabs.core.types import Array, Bool, Key, Params, PyTree
+from diffabs.engine.drive.batches import EarlyEnd, describe_placement, run_on_all_cores, run_on_auto_mesh, run_packed
 from diffabs.engine.drive.engine import check_process, resolve_request, run_with_engine
-from diffabs.engine.drive.packed import EarlyEnd, run_packed
-from diffabs.engine.drive.sharding import describe_placement, run_on_all_cores, run_on_auto_mesh
 from diffabs.engine.hybrid import Objectives
 from diffabs.engine.solvers import Solver
 from diffabs.loop.admissible import batch_admissibility, find_impossible_values, find_unstable_step

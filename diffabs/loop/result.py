@@ -16,8 +16,8 @@ from diffabs.core.jax_flags import default_flags
 from diffabs.core.numerics import invalidate, void_derivatives
 from diffabs.core.protocols import Ending, Objective, Plant, Sample
 from diffabs.core.types import AnyArray, Bool, PyTree, Scalar
+from diffabs.engine.step.event_location import RunStatus
 from diffabs.engine.step.slides import Slide, has_slid, slide_of
-from diffabs.engine.step.status import RunStatus
 from diffabs.loop import convert
 from diffabs.loop.closed_loop import AUDIT_METRIC, Loop, LoopState
 from diffabs.loop.faults import Fault

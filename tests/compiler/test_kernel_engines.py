@@ -26,6 +26,7 @@ from diffabs.compiler.runtime import library_cache, toolchain
 from diffabs.core.protocols import Memory, no_flow
 from diffabs.core.pytree import get, param, pytree
 from diffabs.engine.drive import kernel as native
+from diffabs.engine.drive.batches import describe_placement, run_on_all_cores
 from diffabs.engine.drive.engine import (
     ENGINE_VARIABLE,
     EngineError,
@@ -33,7 +34,6 @@ from diffabs.engine.drive.engine import (
     log_xla_reason,
     resolve_request,
 )
-from diffabs.engine.drive.sharding import describe_placement, run_on_all_cores
 from diffabs.parts.objectives import IAE, StopTime
 from diffabs.robust.design import attraction
 from diffabs.robust.design.attraction import Cells, region_of_attraction
@@ -147,7 +147,7 @@ import numpy as np
 import diffabs as d
 from diffabs.host.process import core_count
 from diffabs.compiler.runtime.cpu import thread_count
-from diffabs.engine.drive.sharding import describe_placement
+from diffabs.engine.drive.batches import describe_placement
 
 assert jax.local_device_count() == 2
 print(thread_count() == core_count())
@@ -159,7 +159,7 @@ print(describe_placement(jax.device_put(np.zeros(4), jax.NamedSharding(mesh, jax
 
 @pytest.mark.slow
 @killed_by("compiler.runtime.cpu", "    return core_count()\n", "    return 1\n")
-@killed_by("engine.drive.sharding", "if any(len(devices) > 1 for devices in places):", "if False:")
+@killed_by("engine.drive.batches", "if any(len(devices) > 1 for devices in places):", "if False:")
 def test_several_devices_of_one_processor():
     """A kernel uses all cores. Runs that lie on several devices are left to XLA."""
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
@@ -168,8 +168,8 @@ def test_several_devices_of_one_processor():
     assert done.stdout.splitlines() == ["True", "''", "the runs lie on several devices"]
 
 
-@killed_by("engine.drive.sharding", "- {default_platform()}", '- {"cpu"}')
-@killed_by("engine.drive.sharding", ' or default_platform() != "cpu"', "")
+@killed_by("engine.drive.batches", "- {default_platform()}", '- {"cpu"}')
+@killed_by("engine.drive.batches", ' or default_platform() != "cpu"', "")
 def test_runs_on_a_gpu(monkeypatch):
     """A kernel can run them where JAX runs on a GPU by default, and they are not dealt to the processor's cores."""
     replace_seam(monkeypatch, "default_platform", lambda: "gpu")

@@ -99,7 +99,7 @@ def usual():
 
 
 @pytest.mark.slow
-@killed_by("engine.drive.sharding", "with default_flags(), jax.enable_x64", "with jax.enable_x64")
+@killed_by("engine.drive.batches", "with default_flags(), jax.enable_x64", "with jax.enable_x64")
 @killed_by("loop.run", "@default_flags()\ndef measure(", "def measure(")
 @killed_by("loop.run", "@default_flags()\ndef rollout(", "def rollout(")
 def test_loops_compute_the_same(strict, usual):

@@ -19,7 +19,7 @@ from diffabs.core.protocols import Memory
 from diffabs.core.pytree import arrays, get, prepare_parts, refine_parts
 from diffabs.engine.admission import build_field
 from diffabs.engine.drive.runs import build_stepping
-from diffabs.engine.step import step_size, surfaces
+from diffabs.engine.step import modes, step_size
 from diffabs.engine.step.adaptive import StateSpan
 from diffabs.engine.step.replay import BASE_LOG_CAPACITY, log_capacity, states_between
 from diffabs.loop.arguments import prepare_arguments
@@ -458,24 +458,22 @@ def test_the_first_step_is_stable():
     assert carry.base == carry.length
 
 
-@killed_by(
-    "engine.step.surfaces", "jnp.where(since < -nearest, -since, NEVER_S)", "jnp.where(since < 0, -since, NEVER_S)"
-)
-@killed_by("engine.step.surfaces", "inside = later & (since >", "inside = (since >")
+@killed_by("engine.step.modes", "jnp.where(since < -nearest, -since, NEVER_S)", "jnp.where(since < 0, -since, NEVER_S)")
+@killed_by("engine.step.modes", "inside = later & (since >", "inside = (since >")
 def test_lines_say_when_comparisons_change_and_when_they_did():
     numbers = np.array([0, 1, 33, 2, 3])
     values, rates = jnp.array([3.0, -2.0, 1.0, 0.5, 4.0]), jnp.array([-1.0, 1.0, 4.0, 1.0, -40.0])
-    margins = surfaces.SwitchingFunctions(numbers, values, rates)
+    margins = modes.SwitchingFunctions(numbers, values, rates)
     words = (jnp.uint32(0b1100), jnp.uint32(0b10))
-    np.testing.assert_array_equal(surfaces.read_bits(words, np.array([2, 3, 33, 1])), [True, True, True, False])
+    np.testing.assert_array_equal(modes.read_bits(words, np.array([2, 3, 33, 1])), [True, True, True, False])
     length = jnp.asarray(1.0)
-    assert surfaces.forecast_crossing(margins, length, 0.0) == pytest.approx(0.1)  # 3 falls by 40/s
+    assert modes.forecast_crossing(margins, length, 0.0) == pytest.approx(0.1)  # 3 falls by 40/s
     # 0.1 s counts as past, and the number 1 rises by 1/s.
-    assert surfaces.forecast_crossing(margins, length, 0.2) == pytest.approx(2.0)
-    assert surfaces.find_imminent(margins, length).number == 3
+    assert modes.forecast_crossing(margins, length, 0.2) == pytest.approx(2.0)
+    assert modes.find_imminent(margins, length).number == 3
     # Bits 2 and 33 changed 0.5 s and 0.25 s ago.
-    assert surfaces.time_since_crossing(margins, words, length) == pytest.approx(0.5)
-    assert surfaces.time_since_crossing(margins, (jnp.uint32(0),) * 2, length) == 0
+    assert modes.time_since_crossing(margins, words, length) == pytest.approx(0.5)
+    assert modes.time_since_crossing(margins, (jnp.uint32(0),) * 2, length) == 0
 
 
 @killed_by(

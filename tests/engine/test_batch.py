@@ -20,9 +20,8 @@ from seams import replace_seam
 import diffabs as d
 from diffabs import controllers, plants
 from diffabs.core.pytree import replace
-from diffabs.engine.drive import packed
-from diffabs.engine.drive.packed import STEPS_PER_EXCHANGE
-from diffabs.engine.drive.sharding import run_on_auto_mesh
+from diffabs.engine.drive import batches
+from diffabs.engine.drive.batches import STEPS_PER_EXCHANGE, run_on_auto_mesh
 from diffabs.loop.batch import Batch, grid, group_by_structure, latin, stack_loops
 from diffabs.parts.objectives import BRAKING, IAE
 from diffabs.parts.sensors import Noise
@@ -109,10 +108,10 @@ class TestLanes:
         run = d.run_batch(LOOP, Batch(VALUES, keys), SOLVER, MEASURED, accepted=True, enough=never)
         same(jax.device_get(run), expected)
 
-    @killed_by("engine.drive.sharding", "reshape(cores, each).T.ravel()[:count]", "ravel()[:count]")
+    @killed_by("engine.drive.batches", "reshape(cores, each).T.ravel()[:count]", "ravel()[:count]")
     @pytest.mark.slow
     @killed_by(
-        "engine.drive.packed",
+        "engine.drive.batches",
         "lane_numbers = numbers[jnp.minimum(slots",
         "lane_numbers = slots.number + 0 * numbers[jnp.minimum(slots",
     )
@@ -170,7 +169,7 @@ class TestLanes:
     @pytest.mark.slow
     @killed_by("loop.ensemble", "    if accepted is True:\n        return run", "    return run", case="together")
     @killed_by(
-        "engine.drive.packed",
+        "engine.drive.batches",
         "jnp.where(run & (number < count), carry.status",
         "jnp.where(number < count, carry.status",
         case="refilled",
@@ -208,10 +207,10 @@ class TestLanes:
         replace_seam(monkeypatch, "lanes_at_once", SOME)
         lanes = Batch(VALUES, keys)
         d.run_batch(LOOP, lanes, SOLVER, MEASURED, accepted=True)
-        before = packed._run._cache_size()
+        before = batches._run._cache_size()
         faster = Batch({**VALUES, "initial.speed": 1.01 * SPEEDS}, keys)
         d.run_batch(LOOP, faster, d.FixedStep(2e-3, 0.4), MEASURED, accepted=True)
-        assert packed._run._cache_size() == before
+        assert batches._run._cache_size() == before
 
 
 class Far(NamedTuple):
@@ -227,7 +226,7 @@ class Far(NamedTuple):
 
 
 @killed_by(
-    "engine.drive.packed",
+    "engine.drive.batches",
     "free = ~slots.carry.running | _lanes_ended_early(enough, build_lane, slots, numbers)",
     "free = ~slots.carry.running",
 )
@@ -371,7 +370,7 @@ def test_a_column_without_numbers_is_refused(given, message):
         Batch(**given)
 
 
-@killed_by("engine.drive.packed", "first_order((hybrid, values, objectives), VALUES_ONLY)", "loop, values, objectives")
+@killed_by("engine.drive.batches", "first_order((hybrid, values, objectives), VALUES_ONLY)", "loop, values, objectives")
 @pytest.mark.parametrize("solver", [SOLVER, d.Adaptive(1e-4, 0.5)])
 def test_lanes_that_make_room_have_no_derivative_by_xla(solver):
     """Of fixed steps it was 1.4 % off: the switches were not located."""
@@ -476,7 +475,7 @@ def placed(values, keys, kind):
     return {path: jax.device_put(x, place) for path, x in values.items()}, jax.device_put(keys, place)
 
 
-@killed_by("engine.drive.sharding", "    if not meshes:", "    if True:")
+@killed_by("engine.drive.batches", "    if not meshes:", "    if True:")
 def test_lanes_on_an_explicit_mesh_are_run_on_an_auto_one():
     """Gathers say nothing of where they lie there; results come back."""
     (speeds,), numbers = (given := placed({"speed": SPEEDS[:4]}, np.arange(4), AxisType.Explicit))[0].values(), given[1]

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 import diffabs as d
 from diffabs.core.pytree import get, replace
 from diffabs.engine.solve import SolutionStatus
-from diffabs.engine.step import fixed, sliding_flow
+from diffabs.engine.step import fixed, slides
 from diffabs.engine.step.modes import ComparisonAnswers, Mode, SlidingSurface
 from diffabs.loop.sliding import describe_slide
 from diffabs.parts.objectives import IAE
@@ -228,8 +228,8 @@ def test_a_wave_that_switches_during_a_slide_is_no_surface_to_slide_along(step):
         np.testing.assert_allclose(slopes, np.diff(ends)[:, 0] / (2 * width), rtol=1e-6)
 
 
-@killed_by("engine.step.sliding_flow", "larger(share, 1.0 - share)", "share")
-@killed_by("engine.step.sliding_flow", "jnp.where(near == beyond, MAX_SHARE, ", "jnp.where(False, MAX_SHARE, ")
+@killed_by("engine.step.slides", "larger(share, 1.0 - share)", "share")
+@killed_by("engine.step.slides", "jnp.where(near == beyond, MAX_SHARE, ", "jnp.where(False, MAX_SHARE, ")
 # The rates p and q of the margin on this and on the other side; where they oppose, the other side's share is p/(p - q).
 @pytest.mark.parametrize(
     ("pushes", "share"),
@@ -247,7 +247,7 @@ def test_a_run_leaves_a_surface_to_the_side_that_both_flows_push_to(pushes, shar
     def look_at_flow(t, z, mode):
         return look(t, z[0]["z"], mode)
 
-    dynamics = sliding_flow.slide(
+    dynamics = slides.slide(
         look_at_flow, jnp.asarray(0.0), ({"z": jnp.asarray(0.0)},), Mode((jnp.uint32(1),), along=along)
     )
     assert dynamics.shares[0] == pytest.approx(share)

@@ -9,7 +9,7 @@ from mutants import killed_by
 import diffabs as d
 from diffabs import controllers, objectives
 from diffabs.engine.field import SolutionStatus
-from diffabs.engine.step.status import RunStatus
+from diffabs.engine.step.event_location import RunStatus
 from diffabs.loop.arguments import prepare_arguments
 from diffabs.loop.result import finish_run
 

@@ -379,7 +379,7 @@ class TestWhoeverRuns:
         assert found["failures"]["not stopped"]["value"] < 0.5
         assert found["failures"]["any"]["high"] < 1 / 2
 
-    @killed_by("engine.drive.packed", "carry.status, RunStatus.REFUSED)", "carry.status, RunStatus.TIMED_OUT)")
+    @killed_by("engine.drive.batches", "carry.status, RunStatus.REFUSED)", "carry.status, RunStatus.TIMED_OUT)")
     @pytest.mark.slow
     def test_a_batch_does_not_run_them(self, any_step):
         values = {"initial.speed": np.array([8.0, 1.0, 9.0])}

@@ -2,7 +2,7 @@
 
 XLA computes the starts and the results, as for every other run. The package `compiler` translates the step of
 `FixedStep` or `Adaptive` from its jaxpr, with everything that the parts contribute to it. A run that has ended makes
-room for the next one, as in `packed`. The kernel deals the runs to threads of its own, on all cores of the processor.
+room for the next one, as in `batches`. The kernel deals the runs to threads of its own, on all cores of the processor.
 """
 
 import functools
@@ -21,13 +21,13 @@ from diffabs.core.log import log_rows
 from diffabs.core.pytree import prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero, read_leaves
 from diffabs.core.types import Bool, Key, Params, PyTree, Scalar, Vector
+from diffabs.engine.drive.batches import STEPS_PER_EXCHANGE, EarlyEnd, sample_now, split_by_lane
 from diffabs.engine.drive.engine import check_process
 from diffabs.engine.drive.loops import STEPS_PER_BLOCK
-from diffabs.engine.drive.packed import STEPS_PER_EXCHANGE, EarlyEnd, sample_now, split_by_lane
 from diffabs.engine.hybrid import Finish, HybridState, HybridSystem, Objectives
 from diffabs.engine.step.adaptive import AdaptiveStepping
+from diffabs.engine.step.event_location import RunStatus
 from diffabs.engine.step.replay import LaggedReplay, LaggedReplayStepping, refuse_derivative
-from diffabs.engine.step.status import RunStatus
 
 MAX_LANES_PER_LAUNCH = 1 << 17  # runs that are started together: the carries of more runs would fill the memory
 
@@ -42,7 +42,7 @@ def run_native(
     finish: Finish,
     enough: EarlyEnd | None = None,
 ) -> PyTree:
-    """Return the result of `packed.run_packed`, equal to rounding and with forward derivatives.
+    """Return the result of `batches.run_packed`, equal to rounding and with forward derivatives.
 
     A step with an operation without a translation raises Unsupported, a machine without a compiler NoCompiler.
     """

@@ -34,10 +34,10 @@ from diffabs.engine.drive.loops import (
 from diffabs.engine.hybrid import Finish, HybridSystem, Objectives, Observe
 from diffabs.engine.solvers import Adaptive, Solver
 from diffabs.engine.step.adaptive import AdaptiveStepping, clip_rtol, keep_steps
+from diffabs.engine.step.event_location import end_unfinished
 from diffabs.engine.step.fixed import FixedStepping
 from diffabs.engine.step.replay import ReplayStepping, log_attempt, log_capacity, refuse_derivative, states_between
 from diffabs.engine.step.slides import has_slid, slide_of
-from diffabs.engine.step.status import end_unfinished
 from diffabs.engine.step.switching import FREE_MODES, KEPT_MODES, KeptModes
 
 

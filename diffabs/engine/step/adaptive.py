@@ -33,10 +33,10 @@ from diffabs.core.types import Any, AnyArray, Array, Bool, Int, Key, PyTree, Sca
 from diffabs.engine.hybrid import HybridState, HybridSystem
 from diffabs.engine.step.advance import Carry, Decision, Judged, advance, cast_floats, start_carry
 from diffabs.engine.step.attempt import Attempt, Point, StepRequest
+from diffabs.engine.step.event_location import RunStatus
 from diffabs.engine.step.modes import SurfaceCrossing
 from diffabs.engine.step.runge_kutta import TSIT5, midpoint_error
 from diffabs.engine.step.slides import begin_slide, ended_slide
-from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.step_size import (
     INITIAL_STEP_S,
     MIN_LOCATION_FRACTION,

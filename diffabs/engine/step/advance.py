@@ -33,7 +33,9 @@ from diffabs.engine.step.attempt import (
 )
 from diffabs.engine.step.event_location import (
     EventSearch,
+    RunStatus,
     init_search,
+    is_running,
 )
 from diffabs.engine.step.modes import Mode
 from diffabs.engine.step.runge_kutta import Tableau
@@ -45,7 +47,6 @@ from diffabs.engine.step.slides import (
     lose_mode,
     watch_landing,
 )
-from diffabs.engine.step.status import RunStatus, is_running
 from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, Objectives, ObservedSystem, build_system
 
 

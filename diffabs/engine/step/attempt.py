@@ -21,9 +21,8 @@ from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment
 from diffabs.core.types import Any, Array, Bool, Int, PyTree, Scalar
 from diffabs.engine.hybrid import HybridSignals, HybridState, HybridSystem, Margins, Objectives
-from diffabs.engine.step.modes import Mode, ModeBits
+from diffabs.engine.step.modes import Mode, ModeBits, valid_end_rates
 from diffabs.engine.step.runge_kutta import Tableau, runge_kutta_scan, runge_kutta_step
-from diffabs.engine.step.surfaces import valid_end_rates
 from diffabs.engine.step.system import (
     Accumulators,
     Evaluation,
@@ -93,7 +92,7 @@ class Attempt(NamedTuple):
         point: The end, before the changes there.
         signals: Signals of the system.
         shift: Time [s] by which the end lies later than requested.
-        shares: Shares of the other answer along each surface; () if the run cannot slide (`sliding_flow`).
+        shares: Shares of the other answer along each surface; () if the run cannot slide (`slides`).
         report: What the stepping method needs for its decision.
     """
 
@@ -216,29 +215,6 @@ def commit_step(
     if hybrid.ticks:
         return evaluate_point(system, end.t, state, end.accumulators, mode, forecast)
     return end._replace(state=state, words=end.words if mode.words is None else mode.words)
-
-
-def mode_in_step(system: ObservedSystem, words: ModeBits, free: Bool) -> Mode:
-    """Return the mode of a step in which the comparisons keep the answers `words`.
-
-    Where it is `free`, each stage evaluates its comparisons, across switching surfaces.
-    """
-    all, none = jnp.uint32(0xFFFFFFFF), jnp.uint32(0)
-    return Mode(words, free, tuple(jnp.where(free, all, none) for _ in range(system.word_count)))
-
-
-def mode_after_changes(words: ModeBits, decided: ModeBits, lands: Bool) -> Mode:
-    """Return the mode in which the dynamics are evaluated after the changes at the end of a step.
-
-    If it `lands` on a switching surface, the bits `decided` keep their answers in `words`: at the zero of a margin,
-    rounding could turn them back. All others are evaluated.
-    """
-    return Mode(words, ~lands, tuple(~jnp.where(lands, bits, jnp.uint32(0)) for bits in decided))
-
-
-def flip_answers(words: ModeBits, bits: ModeBits, lands: Bool) -> ModeBits:
-    """Return the answers with these bits reversed where a step `lands` on the switching surface between them."""
-    return tuple(word ^ jnp.where(lands, bit, jnp.uint32(0)) for word, bit in zip(words, bits, strict=True))
 
 
 def _build_point(

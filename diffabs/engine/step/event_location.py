@@ -1,4 +1,5 @@
-"""Event location: find the zero of a margin within a step, and the length of the step that ends on it.
+"""Status of a run, and event location: find the zero of a margin within a step, and the length of the step that ends
+on it.
 
 A margin of the stop, of a block, or of a comparison in the flow may fall through zero within a step. Then shorter steps
 are attempted until one ends on the zero. So the run discretises the exact solution on both sides of the event, without
@@ -26,6 +27,8 @@ numbers after the last bit. The margin of a comparison is known only at the end 
 Source: A. Griewank, A. Walther, Evaluating Derivatives, section 15.3 (order of the refinement).
 """
 
+import enum
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -34,9 +37,8 @@ import jax.numpy as jnp
 from diffabs.core.lanes import keep_decision, select
 from diffabs.core.numerics import ratio
 from diffabs.core.types import Any, AnyArray, Array, Bool, Int, PyTree, Scalar
-from diffabs.engine.step.modes import ComparisonAnswers, SurfaceCrossing, find_contradicted
-from diffabs.engine.step.status import RunStatus
-from diffabs.engine.step.system import Evaluation
+from diffabs.engine.hybrid import HybridSystem
+from diffabs.engine.step.modes import SurfaceCrossing
 
 NEWTON_RADIUS_STEPS = 1e-4  # steps: a Newton step from here misses the zero by some 1e-8 steps
 PROBE_EXPONENT = 0.2  # the probe is eps**PROBE_EXPONENT steps away
@@ -45,11 +47,67 @@ MAX_LOCATION_ATTEMPTS = 24  # greatest number of attempts for an event, whose ma
 BISECT = 4  # every fourth attempt halves the bracket
 # Fraction of the margin's mean rate in the step. A margin with a slower fall at the beginning only touches zero there.
 GRAZING_FRACTION = 1e-2
-# Fraction of the slope: greatest correction by the cubic through both ends of a step. A larger correction is a kink.
 MAX_PROBE_BEND = 0.1  # greatest share of the slope by which it may change between the place and the probe
+# Fraction of the slope: greatest correction by the cubic through both ends of a step. A larger correction is a kink.
 MAX_CUBIC_CORRECTION = 1e-4
 # Fraction of the fall: greatest change within a step in which the margin counts as smooth.
 MAX_SLOPE_CHANGE = 0.5
+# A landing on the stop may leave at most this fraction of the margin's change in the step.
+MAX_MISSED_FRACTION = 0.1
+
+
+class RunStatus(enum.IntEnum):
+    """Status of a run; every value up to `REFRESHING` means that the run goes on.
+
+    Attributes:
+        RUNNING: The next attempt is an ordinary step.
+        SEEKING: Attempts shrink a bracket around an event.
+        PROBING: The attempt measures how the margin falls near the event.
+        REFINING: The attempt provides second derivatives of the event's time.
+        LANDING: The attempt ends on the event.
+        REFRESHING: A step of length 0 evaluates the rates after the event, or beyond the switching surface.
+        STOPPED: The run is over and has reached its stop.
+        TIMED_OUT: The run is over because its duration has passed.
+        DIVERGED: The run is over because its numbers are invalid, or no step meets its tolerance.
+        EXHAUSTED: The run is over because its attempts are too many.
+        MISSED: The run is over because its landing misses the stop, or its start is beyond the stop.
+        REFUSED: The run was not accepted, and over from the beginning.
+        SLID: The run is over because it slides along a switching surface; only with `WatchedModes`.
+        GRAZED: The run is over because a margin only touches zero; only with `WatchedModes`.
+    """
+
+    RUNNING, SEEKING, PROBING, REFINING, LANDING, REFRESHING, STOPPED, TIMED_OUT = range(8)
+    DIVERGED, EXHAUSTED, MISSED, REFUSED, SLID, GRAZED = range(8, 14)
+
+
+def is_running(carry: PyTree) -> Array:
+    """Return True if the run needs another attempt."""
+    return carry.status <= RunStatus.REFRESHING
+
+
+def end_unfinished(carry: PyTree) -> PyTree:
+    """Return the carry after the last attempt for which there is capacity: a run that still goes on is exhausted."""
+    status = jnp.where(is_running(carry), RunStatus.EXHAUSTED, carry.status)
+    return carry._replace(status=status.astype(carry.status.dtype))
+
+
+def status_after_step(hybrid: HybridSystem, carry: PyTree, attempt: PyTree, decision: PyTree) -> Scalar:
+    """Return the status after an accepted attempt.
+
+    A landing whose margin is too far from zero (`MAX_MISSED_FRACTION`) misses the stop.
+    """
+    before, after, stops = (x["stop"] for x in (carry.point.margins, attempt.point.margins, decision.triggered))
+    at_full = jnp.abs(carry.search.at_full)
+    misses = [
+        stop & ~(jnp.abs(b) <= MAX_MISSED_FRACTION * (a + at_full))
+        for a, b, stop in zip(before, after, stops, strict=True)
+    ]
+    landed = jnp.where(reduce(jnp.logical_or, misses), RunStatus.MISSED, RunStatus.STOPPED)
+    further = jnp.asarray(RunStatus.RUNNING)
+    if not hybrid.ticks:
+        changed = jnp.any(jnp.stack([decision.crosses_surface, *jax.tree.leaves(decision.triggered)]))
+        further = jnp.where(changed, RunStatus.REFRESHING, RunStatus.RUNNING)
+    return jnp.where(reduce(jnp.logical_or, stops), landed, jnp.where(decision.over, RunStatus.TIMED_OUT, further))
 
 
 class EventSearch(NamedTuple):
@@ -151,13 +209,6 @@ def _find_event_crossings(number: Array, first: int, before: list[PyTree], after
     picked = [EventCrossing(i, _pick(i - first, after), _pick(i - first, before)) for i in (number, unsought)]
     falls = _pick(number - first, crossed) & (number >= first)
     return AttemptCrossings(picked[0], falls, picked[1], jnp.any(jnp.stack(unsought_falls)))
-
-
-def find_surface_crossing(dynamics: Evaluation, number: Array, like: Scalar) -> SurfaceCrossing:
-    """Return the comparisons whose answers at the end of a step contradict its mode; `like` has the margin's type."""
-    surfaces = dynamics.surfaces
-    answers = ComparisonAnswers(dynamics.words, dynamics.contradicted, surfaces.numbers, surfaces.values)
-    return find_contradicted(answers, number, like)
 
 
 def find_crossings(

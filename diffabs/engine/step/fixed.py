@@ -19,11 +19,11 @@ from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState, HybridSystem
 from diffabs.engine.step.advance import Carry, Decision, Judged, advance, cast_floats, start_carry
 from diffabs.engine.step.attempt import Attempt, StepRequest
+from diffabs.engine.step.event_location import RunStatus
 from diffabs.engine.step.modes import SurfaceCrossing
 from diffabs.engine.step.outlook import look_ahead
 from diffabs.engine.step.runge_kutta import RK4
 from diffabs.engine.step.slides import begin_slide, ended_slide
-from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.switching import FREE_MODES, KEPT_MODES, UNSWITCHED, Checks, ModeGuard, Strain, Unswitched
 from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, Objectives, ObservedSystem
 

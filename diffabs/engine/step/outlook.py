@@ -15,10 +15,9 @@ from diffabs.core.lanes import any_lane
 from diffabs.core.types import Array, Bool, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState
 from diffabs.engine.step.advance import Carry
-from diffabs.engine.step.attempt import mode_in_step
-from diffabs.engine.step.modes import stack_flat
+from diffabs.engine.step.event_location import RunStatus
+from diffabs.engine.step.modes import mode_in_step, stack_flat
 from diffabs.engine.step.slides import along_of
-from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.system import Evaluation, ObservedSystem
 
 # A margin grazes if its least magnitude in the step is below this fraction, or this multiple of the machine epsilon, of
@@ -123,7 +122,7 @@ def margin_error(system: ObservedSystem, carry: PyTree, h: Scalar, dynamics: Eva
     point = carry.point
     step = HermiteStep(point.t, point.t + h, (point.state.flow(), state.flow()), (point.rates[0], dynamics.rates[0]))
     middle = point.t + 0.5 * h
-    mode = mode_in_step(system, point.words, carry.unrestricted)
+    mode = mode_in_step(point.words, carry.unrestricted)
     middle_margins = system.list_margins(middle, point.state.with_flow(step.at(middle)), point.accumulators, mode)
     middle_margins = jnp.concatenate([jnp.ravel(x) for x in middle_margins])
     start = _outlook(carry)

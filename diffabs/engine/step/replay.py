@@ -28,11 +28,11 @@ from diffabs.engine.hybrid import HybridState, HybridSystem
 from diffabs.engine.solvers import ADAPTIVE_ERROR_ORDER, Adaptive
 from diffabs.engine.step.adaptive import AdaptiveStepping, StateSpan, clip_rtol, next_span
 from diffabs.engine.step.advance import Carry, Decision, advance, cast_floats, start_carry
-from diffabs.engine.step.attempt import Attempt, StepRequest, mode_in_step
-from diffabs.engine.step.modes import ModeBits, SlidingSurface, pick_number
+from diffabs.engine.step.attempt import Attempt, StepRequest
+from diffabs.engine.step.event_location import RunStatus
+from diffabs.engine.step.modes import ModeBits, SlidingSurface, mode_in_step, pick_number
 from diffabs.engine.step.runge_kutta import TSIT5
 from diffabs.engine.step.slides import along_of, is_return
-from diffabs.engine.step.status import RunStatus
 from diffabs.engine.step.switching import Replayed
 from diffabs.engine.step.system import Evaluation, Objectives, ObservedSystem
 
@@ -149,7 +149,7 @@ class ReplayStepping:
         end = jnp.where(entry.refresh, carry.point.t, entry.t)
         step, next = (entry.words, entry.along), (entry.next_words, entry.next_along)
         words, along = select(entry.refresh, next, step)
-        mode = mode_in_step(system, words, entry.unrestricted)._replace(along=along)
+        mode = mode_in_step(words, entry.unrestricted)._replace(along=along)
         strikes = entry.k != k
 
         def shift_end(end: Evaluation) -> Scalar:
@@ -179,7 +179,7 @@ class ReplayStepping:
         entry, no = self.entry, jnp.asarray(False)
         margins, tree = jax.tree.flatten(attempt.point.margins)
         triggered = tree.unflatten([entry.triggered & (1 << i) != 0 for i in range(len(margins))])
-        mode = mode_in_step(system, entry.next_words, no)._replace(along=entry.next_along)
+        mode = mode_in_step(entry.next_words, no)._replace(along=entry.next_along)
         return Decision(active, active, no, entry.lands >= 0, triggered, mode, entry.over)
 
     def plan_next(

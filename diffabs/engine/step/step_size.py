@@ -1,6 +1,6 @@
 """Length of an adaptive step: limits by its error, by stability, by switching surfaces and by clocks.
 
-`surfaces` says when the run crosses the next switching surface.
+`modes` says when the run crosses the next switching surface.
 """
 
 from functools import reduce

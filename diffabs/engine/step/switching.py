@@ -19,27 +19,41 @@ from diffabs.core.lanes import any_lane, keep_decision, select
 from diffabs.core.types import Any, Array, Bool, Int, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState
 from diffabs.engine.step.advance import Carry, Decision, Judged
-from diffabs.engine.step.attempt import Attempt, StepRequest, flip_answers, mode_after_changes, mode_in_step
+from diffabs.engine.step.attempt import Attempt, StepRequest
 from diffabs.engine.step.event_location import (
     MAX_LOCATION_ATTEMPTS,
+    RunStatus,
     SearchPlan,
-    SurfaceCrossing,
     continue_search,
     falls_through,
     find_crossings,
-    find_surface_crossing,
+    status_after_step,
 )
-from diffabs.engine.step.modes import Mode, ModeBits, single_bit
-from diffabs.engine.step.outlook import Outlook, Turns, look_ahead, margin_error, watch_margins
-from diffabs.engine.step.slides import SlideWatch, along_of, decided_answers, has_slid, init_watch, slide_of
-from diffabs.engine.step.sliding_flow import MAX_SURFACES
-from diffabs.engine.step.status import RunStatus, status_after_step
-from diffabs.engine.step.surfaces import (
+from diffabs.engine.step.modes import (
+    ComparisonAnswers,
+    Mode,
+    ModeBits,
+    SurfaceCrossing,
+    find_contradicted,
     find_imminent,
     find_return,
+    flip_answers,
     forecast_crossing,
     is_surface_moving,
+    mode_after_changes,
+    mode_in_step,
+    single_bit,
     time_since_crossing,
+)
+from diffabs.engine.step.outlook import Outlook, Turns, look_ahead, margin_error, watch_margins
+from diffabs.engine.step.slides import (
+    MAX_SURFACES,
+    SlideWatch,
+    along_of,
+    decided_answers,
+    has_slid,
+    init_watch,
+    slide_of,
 )
 from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, ObservedSystem
 
@@ -341,7 +355,9 @@ class KeptModes(FreeModes):
         return jnp.where(horizon.unrestricted, 1.0, CROSSING_OVERREACH) * ahead, self.look_ahead(horizon, dynamics)
 
     def find_surface(self, carry: Carry, h: Scalar, dynamics: Evaluation) -> SurfaceCrossing | None:
-        return find_surface_crossing(dynamics, carry.search.number, h)
+        surfaces = dynamics.surfaces
+        answers = ComparisonAnswers(dynamics.words, dynamics.contradicted, surfaces.numbers, surfaces.values)
+        return find_contradicted(answers, carry.search.number, h)
 
     def guard(self, judged: Judged, after: Carry, strain: Strain) -> ModeGuard:
         """Return what becomes of the mode after an attempt.
@@ -365,7 +381,7 @@ class KeptModes(FreeModes):
     def _mode_of_step(self, system: ObservedSystem, carry: Carry, refresh: Bool) -> Mode:
         words, lands = carry.point.words, carry.search.number < system.bit_count
         beyond = mode_after_changes(words, decided_answers(carry, system.word_count), lands)
-        mode = select(refresh, beyond, mode_in_step(system, words, carry.unrestricted))
+        mode = select(refresh, beyond, mode_in_step(words, carry.unrestricted))
         return mode._replace(along=along_of(carry))
 
     def _crossed_surfaces(self, attempt: Attempt) -> list[Bool]:

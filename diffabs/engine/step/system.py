@@ -18,9 +18,8 @@ from diffabs.core.protocols import Memory, Segment
 from diffabs.core.types import PyTree, Scalar
 from diffabs.engine.hybrid import HybridSignals, HybridState, HybridSystem, Margins, Objectives
 from diffabs.engine.step.comparisons import SwitchedProgram
-from diffabs.engine.step.modes import ComparisonAnswers, Mode, ModeBits
-from diffabs.engine.step.sliding_flow import SlidingDynamics, return_to_surfaces, slide
-from diffabs.engine.step.surfaces import SwitchingFunctions
+from diffabs.engine.step.modes import ComparisonAnswers, Mode, ModeBits, SwitchingFunctions
+from diffabs.engine.step.slides import SlidingDynamics, return_to_surfaces, slide
 
 Accumulators = dict[str, Memory]
 

@@ -24,8 +24,8 @@ import numpy as np
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import JsonObject, Params, PyTree, Scalar, Table
 from diffabs.core.units import resolve_unit, units_of
+from diffabs.engine.drive.batches import describe_placement
 from diffabs.engine.drive.engine import describe_engine, log_kernel, log_xla_reason, resolve_request
-from diffabs.engine.drive.sharding import describe_placement
 from diffabs.loop.admissible import batch_admissibility
 from diffabs.loop.batch import Batch
 from diffabs.loop.ensemble import kernel_objection, run_batch

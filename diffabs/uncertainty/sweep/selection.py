@@ -7,8 +7,8 @@ records.
 import dataclasses
 import pathlib
 
+from diffabs.engine.drive.batches import describe_placement
 from diffabs.engine.drive.engine import resolve_request
-from diffabs.engine.drive.sharding import describe_placement
 from diffabs.uncertainty.sweep.manifest import read_manifest
 from diffabs.uncertainty.sweep.runner import find_study_objection
 from diffabs.uncertainty.sweep.seal import SweepError
