@@ -174,7 +174,7 @@ CONTROLLED = {
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("name", cases(CONTROLLED, "sliding mode"))
-@killed_by("engine.step.sliding_flow", "ahead, bits = share * (1.0 - share),", "ahead, bits = share - share + 1.0,")
+@killed_by("engine.step.slides", "ahead, bits = share * (1.0 - share),", "ahead, bits = share - share + 1.0,")
 def test_laws_that_switch_without_end_have_the_exact_derivatives(name, solver):
     rates, y0, p, exact = CONTROLLED[name]
 

@@ -49,7 +49,17 @@ from diffabs.engine.step.step_size import (
     shortest_step,
     spectral_step_limit,
 )
-from diffabs.engine.step.switching import FREE_MODES, KEPT_MODES, UNSWITCHED, Checks, Horizon, ModeGuard, Strain, Trial
+from diffabs.engine.step.switching import (
+    FREE_MODES,
+    KEPT_MODES,
+    UNSWITCHED,
+    Checks,
+    Horizon,
+    ModeGuard,
+    NextAttempt,
+    Strain,
+    Trial,
+)
 from diffabs.engine.step.system import Evaluation, Objectives, ObservedSystem
 
 MIN_RTOL_EPS = 32  # multiples of machine epsilon: the smallest error that a step can reach
@@ -309,12 +319,8 @@ class AdaptiveStepping:
         ends_on_crossing = ~accepted & (report.past_crossing > 0) & decision.valid
         length = jnp.where(ends_on_crossing, jnp.maximum(carry.length - report.past_crossing, self.closest), length)
         length = jnp.where(count.falls_short, SHORT_OF_SURFACE_FRACTION * carry.length, length)
-        searches, status = decision.searches, after.status
-        if self.switches.watches:  # a step without a mode goes as far as the one that failed
-            length = jnp.where(guard.unrestricted, carry.length, length)
-        if self.switches.keeps_mode:
-            searches, length = searches & ~guard.abandons, jnp.where(guard.abandons, longest, length)
-            status = jnp.where(guard.abandons, RunStatus.RUNNING, status)
+        plan = NextAttempt(decision.searches, length, after.status)
+        searches, length, status = self.switches.resume(plan, longest, carry, guard)
         # A landing with invalid numbers is no landing: the step is attempted again, and its event located again.
         status = jnp.where(~accepted & ~searches & (status == RunStatus.LANDING), RunStatus.RUNNING, status)
         refreshes = status == RunStatus.REFRESHING

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from diffabs.core.types import Array, Bool, Int, Key, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState, HybridSystem
 from diffabs.engine.step.advance import Carry, Decision, Judged, advance, cast_floats, start_carry
-from diffabs.engine.step.attempt import Attempt, StepRequest
+from diffabs.engine.step.attempt import Attempt, Point, StepRequest
 from diffabs.engine.step.event_location import RunStatus
 from diffabs.engine.step.modes import SurfaceCrossing
 from diffabs.engine.step.outlook import look_ahead
@@ -141,15 +141,13 @@ class FixedStepping:
 
     def without_switches(self) -> "FixedStepping":
         """Return the method for a field without comparisons and events."""
-        return dataclasses.replace(self, switches=UNSWITCHED)
+        return PlainFixedStepping(self.h, self.steps, UNSWITCHED)
 
     def capacity(self, hybrid: HybridSystem, steps: int) -> int:
         """Return the capacity of a scan for this number of `steps`: the greatest usual number of attempts.
 
         An event takes at least four attempts. One of them is REFINING, which `FixedStepControl.extra` does not count.
         """
-        if self.switches == UNSWITCHED:
-            return steps
         crossings = self.crossing_attempts if self.switches.keeps_mode else 0
         about = (crossings + (EVENT_ATTEMPTS_PER_STEP if hybrid.eventful else 0)) * steps + SPARE_ATTEMPTS
         return steps + SPARE_ATTEMPTS + about + about // 3
@@ -160,11 +158,7 @@ class FixedStepping:
 
     def propose(self, system: ObservedSystem, carry: Carry) -> StepRequest:
         """Return the next step to attempt, by the run of `carry` in `system`."""
-        strike = carry.k + 1
-        if self.switches == UNSWITCHED:  # each attempt goes to the next instant
-            no, yes = jnp.asarray(False), jnp.asarray(True)
-            return StepRequest(self.h, strike * self.h, self.h, UNCONSTRAINED, no, yes, strike)
-        return self.switches.propose(system, carry, self.h, strike)
+        return self.switches.propose(system, carry, self.h, carry.k + 1)
 
     def forecast(self, carry: Carry, dynamics: Evaluation) -> PyTree:
         """Return the `Outlook` of a method that watches all margins, and else nothing."""
@@ -185,9 +179,7 @@ class FixedStepping:
         self, system: ObservedSystem, carry: Carry, request: StepRequest, attempt: Attempt, active: Bool
     ) -> Decision:
         """Return the decision: the numbers must be finite and, within a mode, plausible."""
-        end = attempt.point
-        # The rates at the end of a smooth run are used nowhere else but in samples of its last step.
-        numbers = jax.tree.leaves((end.state.flow(), end.rates[0] if self.switches == UNSWITCHED else ()))
+        numbers = jax.tree.leaves(self._list_numbers(attempt.point))
         valid = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in numbers]))
         if self.switches.keeps_mode:  # a run that slides is moved onto its surface, which no rate predicts
             valid &= carry.unrestricted | request.mode.slides | _is_plausible(carry, attempt)
@@ -198,8 +190,6 @@ class FixedStepping:
         self, system: ObservedSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
     ) -> Carry:
         """Return `after` with length and status of the next attempt, which goes to the grid or continues the search."""
-        if self.switches == UNSWITCHED:
-            return after._replace(status=jnp.where(decision.valid, after.status, RunStatus.DIVERGED))
         control, on_grid = carry.control, decision.accepted & carry.strikes
         extra = control.extra + jnp.where(on_grid | (carry.status == RunStatus.REFINING), 0, 1)
         in_step = jnp.where(on_grid, 0, control.in_step + extra - control.extra)
@@ -242,8 +232,40 @@ class FixedStepping:
             after = after._replace(slides=watch._replace(lost=slide))
         return after, guard
 
+    def _list_numbers(self, end: Point) -> PyTree:
+        """Return the numbers at the end of an attempt that must be finite."""
+        return end.state.flow()
+
     def _look_ahead(self, fresh: Bool, ended: Int, dynamics: Evaluation) -> PyTree:
         return look_ahead(fresh, ended, dynamics) if self.has_margin_rates else ()
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps"], meta_fields=["switches", "second_order"])
+@dataclasses.dataclass(frozen=True)
+class PlainFixedStepping(FixedStepping):
+    """Steps of a field without comparisons and events: each attempt is a step to the next instant of the grid."""
+
+    def capacity(self, hybrid: HybridSystem, steps: int) -> int:
+        """Return the number of `steps`."""
+        del hybrid
+        return steps
+
+    def propose(self, system: ObservedSystem, carry: Carry) -> StepRequest:
+        """Return the step to the next instant, whose length is a constant."""
+        del system
+        strike, no, yes = carry.k + 1, jnp.asarray(False), jnp.asarray(True)
+        return StepRequest(self.h, strike * self.h, self.h, UNCONSTRAINED, no, yes, strike)
+
+    def plan_next(
+        self, system: ObservedSystem, carry: Carry, attempt: Attempt, decision: Decision, after: Carry
+    ) -> Carry:
+        """Return `after`, diverged if the numbers are invalid."""
+        del system, carry, attempt
+        return after._replace(status=jnp.where(decision.valid, after.status, RunStatus.DIVERGED))
+
+    def _list_numbers(self, end: Point) -> PyTree:
+        # The rates at the end are used nowhere else but in samples of the last step.
+        return end.state.flow(), end.rates[0]
 
 
 def _is_plausible(carry: Carry, attempt: Attempt) -> Bool:

@@ -168,6 +168,20 @@ class ModeGuard(NamedTuple):
     slides: Bool
 
 
+class NextAttempt(NamedTuple):
+    """A plan of the next attempt.
+
+    Attributes:
+        searches: True if it is one of a search.
+        length: Its length [s] if it is not.
+        status: Status of the run, a `RunStatus`.
+    """
+
+    searches: Bool
+    length: Scalar
+    status: Scalar
+
+
 @dataclasses.dataclass(frozen=True)
 class Replayed:
     """A log says where steps end, and in which modes.
@@ -237,6 +251,11 @@ class Unswitched(Replayed):
         """Return the comparisons that contradict the mode of an attempt; None if it has none."""
         del carry, h, dynamics
         return None
+
+    def resume(self, plan: NextAttempt, regular: Scalar, carry: Carry, guard: ModeGuard) -> NextAttempt:
+        """Return the next attempt as planned or, after a mode has ended, one of the `regular` length [s]."""
+        del regular, carry, guard
+        return plan
 
     def judge(self, status: Scalar, slides: Bool, grazes: Bool, after: Carry) -> Scalar:
         """Return the `status`, or that of a run which is over because it slides or grazes."""
@@ -370,6 +389,12 @@ class KeptModes(FreeModes):
         same = jnp.all(jnp.array([a == b for a, b in pairs], bool))
         return ModeGuard(fails, (judged.carry.unrestricted | leaves) & ~(strain.calm & same), abandons, False)
 
+    def resume(self, plan: NextAttempt, regular: Scalar, carry: Carry, guard: ModeGuard) -> NextAttempt:
+        del carry
+        searches = jnp.logical_and(plan.searches, ~guard.abandons)
+        length = jnp.where(guard.abandons, regular, plan.length)
+        return NextAttempt(searches, length, jnp.where(guard.abandons, RunStatus.RUNNING, plan.status))
+
     def _leave_mode(self, judged: Judged, after: Carry, strain: Strain) -> tuple[Bool, Bool, Bool]:
         """Return whether a search fails, whether this or other strain ends a mode, and whether it ends an attempt."""
         system, carry, _, decision = judged
@@ -416,6 +441,11 @@ class WatchedModes(KeptModes):
         # root of a level. One step without a mode goes there. If the level stays, so does the run.
         fails, slides, abandons = self._leave_mode(judged, after, strain)
         return ModeGuard(fails, jnp.logical_and(strain.stuck, ~judged.carry.unrestricted), abandons, slides)
+
+    def resume(self, plan: NextAttempt, regular: Scalar, carry: Carry, guard: ModeGuard) -> NextAttempt:
+        # A step without a mode goes as far as the one that failed.
+        length = jnp.where(guard.unrestricted, carry.length, plan.length)
+        return super().resume(plan._replace(length=length), regular, carry, guard)
 
     def judge(self, status: Scalar, slides: Bool, grazes: Bool, after: Carry) -> Scalar:
         del after
