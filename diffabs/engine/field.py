@@ -28,12 +28,12 @@ from diffabs.core.lanes import any_lane, select
 from diffabs.core.protocols import Clock, Ending, Memory, Objective, Segment
 from diffabs.core.pytree import param, part, pytree, static
 from diffabs.core.types import Array, Bool, Int, PyTree, Scalar
-from diffabs.engine.hybrid import Margins
+from diffabs.engine.hybrid import Fired, Margins
 from diffabs.engine.step.attempt import Point
 
-# Fractions of the span. A landing is at most `LANDING_FRACTION` from the zero of its condition. Events that follow
-# each other within it have no end, after `MAX_QUICK_EVENTS` of them. A save belongs to the step after an event that
-# is not `COINCIDENCE_FRACTION` later.
+# Fractions of the span. A landing is at most `LANDING_FRACTION` from the zero of its condition. A run is `CROWDED`
+# after `MAX_QUICK_EVENTS` instants of events, each within that time of the one before. A save at most
+# `COINCIDENCE_FRACTION` before an event has the state after it.
 LANDING_FRACTION, MAX_QUICK_EVENTS, COINCIDENCE_FRACTION = 1e-7, 8, 1e-10
 # The lift: time in which the condition moves as far, as a fraction of the span, and multiples of the rounding.
 LIFT_FRACTION, LIFT_EPS = 1e-12, 32
@@ -48,7 +48,8 @@ class SolutionStatus(enum.IntEnum):
         FINISHED: It reached t1.
         TERMINATED: A terminal event ended it.
         DIVERGED: A number is not finite, no step meets its tolerance, or the steps would be too many.
-        SLID: It slides along a switching surface of the field, or crosses surfaces ever faster.
+        SLID: It slides along a switching surface of the field, or crosses surfaces ever faster; with fixed steps also
+            if a field with switches or events has numbers that are not finite, or change too fast for a step.
         CROWDED: Events follow each other without end, as the bounces of a ball that comes to rest, or where a reset
             sets its own condition to zero and it falls.
         GRAZED: A switching surface or the zero of a condition is only touched, or a condition jumps.
@@ -82,7 +83,7 @@ class EventMemory(NamedTuple):
         times: Times of the first ones in units of the span, shape (events, kept).
         lifts: Numbers that are added to the conditions, shape (events,).
         last: Time of the last event in units of the span.
-        quick: Number of events that followed their predecessor at once.
+        quick: Number of successive instants of events, each at once after the one before.
         fault: `SolutionStatus` that ends the run, as a float; 0 for none.
         ends: Number of the terminal event that a reset has made happen, from 1, as a float; 0 for none.
     """
@@ -292,7 +293,7 @@ class FieldSystem:
         state: FieldState,
         before: FieldSignals,
         margins: Margins,
-        fired: Margins,
+        fired: Fired,
         passed: dict[str, PyTree] | None = None,
     ) -> FieldState:
         """Return the state after the events that have `fired`; a reset may make a later event of the list happen."""
@@ -325,7 +326,7 @@ class FieldSystem:
         follow = jnp.ones_like(t), self._rate(t, state.y)
         (y, after), (_, moves), happened = jax.jvp(apply_resets, (t, state.y), follow, has_aux=True)
         each = zip(self.code.inner, happened, fired, was, held.lifts, after, moves, strict=True)
-        lifts, faults = zip(*(self._arm(t, state.y, y, *some) for some in each), strict=True)
+        lifts, faults = zip(*(self._rearm(t, state.y, y, *some) for some in each), strict=True)
         events = jnp.stack(happened)
         now = jnp.arange(self.times_per_event) == held.counts[:, None]
         quick = jnp.where(t - held.last < LANDING_FRACTION, held.quick + 1.0, 0.0)
@@ -347,7 +348,7 @@ class FieldSystem:
         )
         return FieldState(y, jax.tree.map(lambda x: jnp.asarray(x, t.dtype), held))
 
-    def _arm(
+    def _rearm(
         self,
         t: Array,
         before: object,
@@ -423,7 +424,7 @@ class FieldSystem:
 
 @pytree
 class Saves:
-    """An objective that keeps the state at given times, from the cubic of each step."""
+    """A recorder in the form of an objective: it keeps the state at given times, from the cubic of each step."""
 
     places: Array = param(unit="1", free=True)
     """Times as shares of the span, shape (n,)."""

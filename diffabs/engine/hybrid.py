@@ -5,9 +5,10 @@
 
 An event is the instant at which a margin falls through zero. The flow is smooth between instants but for comparisons,
 which the engine finds (`step.comparisons`). Clients: a closed loop (`loop.closed_loop.Loop`), the field of a user
-(`solve.FieldSystem`). A system without flow is a difference equation, one without clocks and margins a smooth field.
+(`field.FieldSystem`). A system without flow is a difference equation, one without clocks and events a smooth field.
 
-A system is a pytree whose leaves are its parameters. Its state and its signals are pytrees, too.
+A system is a dataclass and a pytree (`core.pytree.pytree`), whose leaves are its parameters. Its state and its signals
+are pytrees, too.
 """
 
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from diffabs.core.cubic import HermiteStep
 from diffabs.core.protocols import Clock, Objective
 from diffabs.core.types import Int, PyTree, Scalar
 
-Margins = dict[str, tuple[Any, ...]]  # by name; "stop" is one of them, and each of its margins ends a run
+Margins = dict[str, tuple[Any, ...]]  # by name; "stop" has at least one, and each of its margins ends a run
 Fired = dict[str, tuple[Any, ...]]  # by the names of the margins: True for each that has fallen through zero
 Objectives = dict[str, Objective]
 Finish = Callable[[Any, Any, PyTree], tuple[Any, PyTree]]  # of system, objectives, last carry: result, last observation
@@ -85,12 +86,12 @@ class HybridSystem(Protocol):
 
     @property
     def eventful(self) -> bool:
-        """Whether there are margins besides that of the stop."""
+        """Whether an event can happen, one that ends the run included; a stop that never comes is none."""
         ...
 
     @property
     def jumps(self) -> bool:
-        """Whether a rate jumps where a comparison changes: then fixed steps end there for values, too."""
+        """Whether a rate of the flow jumps where a comparison changes: then fixed steps end there for values, too."""
         ...
 
     @property
@@ -129,8 +130,9 @@ class HybridSystem(Protocol):
     ) -> Any:
         """Return the state after an instant, of the state, the signals `before` it, and its margins.
 
-        Where a run ends it is not called. `passed` has the recorded signals over the step that ends here; None at the
-        start of a run.
+        It is evaluated at the end of every attempt, and used if the attempt is accepted and the run goes on. Without a
+        tick or a fired margin it returns the state. `passed` has the recorded signals over the step that ends here;
+        None at the start of a run.
         """
         ...
 

@@ -1,7 +1,7 @@
 """Solutions of any field, with events; undeclared switches of the field are located, as in every run.
 
 `field` has the hybrid system of a field with events, `admission` makes it of the arguments. Some runs have no right
-answer, or none that could be computed: `SolutionStatus` names them, and every number of such a solution is NaN.
+answer, or none that could be computed: `SolutionStatus` names them, and their times and states are NaN.
 """
 
 from collections.abc import Sequence
@@ -109,8 +109,8 @@ def solve(
         t0: Start [unit of time of the field].
         t1: End; before t0, time runs backwards.
         args: Anything that the functions need, a pytree of arrays and numbers.
-        solver: `FixedStep` or `Adaptive`. Only `step` or `rtol` is read: t0 and t1 replace the duration, and `save` the
-            stride. Fixed steps are shortened to a whole number.
+        solver: `FixedStep` or `Adaptive`. `step` or `rtol`, and `follow_slides`, are read: t0 and t1 replace the
+            duration, and `save` the stride. Fixed steps are shortened to a whole number.
         events: Events; several at one instant happen in this order. One exactly at t1 does not happen. A terminal
             event at the instant of others may come before or after them; after it, none happens.
         save: Times between t0 and t1 at which the state is returned, shape (n,); None for the state at the end.
@@ -119,7 +119,7 @@ def solve(
         kept_events: Number of times that are kept of each event.
 
     Returns:
-        The solution. Read its `status`: without a valid one its numbers are NaN.
+        The solution. Read its `status`: beyond `TERMINATED` its times and states are NaN, and its counts those so far.
 
     Raises:
         ValueError: An argument is invalid. A switch of the field cannot be located: it is no comparison, such as
@@ -168,6 +168,7 @@ def solve(
         raise ValueError(f"kept_events = {kept_events!r} is no whole number of at least 1")
     system, save_objective = build_field(field, y0, t0, t1, args, events, save, int(kept_events))
     any_solver: Any = solver
+    # The method's rule is `WatchedModes`: a run that slides or grazes is over.
     method, count = read_solver(any_solver, t0, t1, system.inputs["t0"].dtype)
     program = trace_field(system)
     switched = bool(program.bit_count or events)

@@ -49,8 +49,8 @@ class RunPlan(NamedTuple):
             The result of a run with a trajectory has the fields `trajectory` and `diverged`.
         observe: Function that returns an observation from system, time, state, and whether the run goes on: a pytree
             with an attribute `running`; None if no run has a trajectory.
-        room: Capacity for attempts in the whole run with adaptive steps. With fixed steps for steps of the grid: in the
-            whole run, or between two instants of a trajectory.
+        room: Capacity for attempts in the whole run with adaptive steps. With fixed steps for steps of the grid;
+            not read for a trajectory.
         instants: Capacity for instants of a trajectory after t = 0; 0 without one.
         every: Number of grid steps between two instants; 0 without a trajectory.
     """

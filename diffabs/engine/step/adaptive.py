@@ -14,8 +14,8 @@ Clocks strike on the grid of `Adaptive.step`, and a trajectory keeps instants of
 
 A run that is logged for derivatives keeps to one mode in a step, and locates switching surfaces as events.
 
-With `WatchedModes` a run that it cannot resolve is over. It slides along a surface (`SLID`), or a margin only touches
-zero (`GRAZED`).
+A run that slides along a surface and does not follow it is over (`SLID`). With `WatchedModes` so is one whose margin
+only touches zero (`GRAZED`).
 """
 
 import dataclasses
@@ -65,7 +65,7 @@ from diffabs.engine.step.system import Evaluation, Objectives, ObservedSystem
 MIN_RTOL_EPS = 32  # multiples of machine epsilon: the smallest error that a step can reach
 DERIVATIVE_RTOL_FRACTION = 0.03  # fraction of the allowed error of a step, for derivatives
 ATTEMPTS_PER_RENEWAL = 16  # attempts between two updates of the stability limit
-# A run with more attempts in all, or per instant of its grid, makes no progress and has diverged.
+# A run with more attempts than the first number plus the second for each instant of its grid is EXHAUSTED.
 MAX_ATTEMPTS, ATTEMPTS_PER_INSTANT = 100_000, 16
 # Fraction of the length that the error allows. A longer regular step resets the count of consecutive crossings.
 RESET_STEP_FRACTION = 0.1
@@ -176,7 +176,7 @@ class AdaptiveStepping:
         steps: Number of the last instant of the grid.
         rtol: Allowed relative error of a step.
         switches: What they do about switches. A run that is logged for a replay with derivatives keeps modes.
-        stable: True if stability limits a step, too. The error of a run at rest shows no derivative that grows.
+        stable: True if stability limits a step, too. A run at rest has no error, but its derivative may grow.
     """
 
     h: Array

@@ -2,8 +2,10 @@
 
     propose    which step to attempt, in which mode
     attempt    `attempt.attempt_step`: the same for every method
+    report     what the method finds in it
     decide     accept the step, search within it, or end the run
     commit     `attempt.commit_step`: the same for every method
+    conclude   the status after it, and the search for an event
     plan_next  the length and status of the next attempt
 
 `FixedStepping`, `AdaptiveStepping` and `ReplayStepping` differ in these and in the coefficients of their step.
@@ -163,9 +165,9 @@ class Stepping(Protocol):
         ...
 
     def forecast(self, carry: Carry, dynamics: Evaluation) -> PyTree:
-        """Return the predicted time [s] to the next change of a comparison, from the `dynamics` at an instant.
+        """Return what the method foresees from the `dynamics` at an instant, for its own later functions.
 
-        A method without a prediction returns (). `carry` is the run before the step that ends at the instant.
+        `carry` is the run before the step that ends at the instant.
         """
         ...
 
@@ -193,8 +195,8 @@ class Stepping(Protocol):
     ) -> Carry:
         """Return the carry `after` an `attempt` with length and status of the next attempt.
 
-        `carry` is the run in `system` before the attempt, and `decision` the decision on it. `after` has the new point
-        what `Replayed.conclude` adds: from a method with switches the status, the search and its length.
+        `carry` is the run in `system` before the attempt, and `decision` the decision on it. `after` has the new
+        point and what `SwitchRule.conclude` has set: with switches the status, the search and its length.
         """
         ...
 
@@ -292,7 +294,7 @@ def start_carry(
 ) -> Carry:
     """Return the carry of a run at t = 0, without the numbers of the stepping method.
 
-    A run that starts at its stop or beyond has diverged.
+    A run that starts at its stop or beyond is over: MISSED.
     """
     none, zero = 0.0 * stepping.h, jnp.asarray(0)
     # With the types of later steps the loop is traced once for all of them.

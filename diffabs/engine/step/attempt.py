@@ -72,7 +72,8 @@ class StepRequest(NamedTuple):
         strikes: True if the step ends where a clock strikes, or with the run.
         strike: Number of that instant of the grid.
         shift_end: Function that returns the time [s] to add to the step, from the dynamics at its requested end; None
-            for none. The time is zero to rounding, but has the derivative of the event's time there.
+            for none. For an event the time is zero to rounding, for a comparison minus the time beyond the surface. It
+            has the derivative of the event's time.
     """
 
     h: Scalar

@@ -14,8 +14,9 @@ a later correction.
     seek    attempts shrink a bracket, by secant, by Newton's step on a parabola, or by bisection, until one ends near
             the zero
     probe   an attempt beside it, on the same side of the zero, measures how the margin falls there
-    land    the final step has the length place - margin(place)/fall. Its derivative is that of the event's time by the
-            implicit function theorem: the margin at the end of an attempt carries the derivative
+    land    the final step has the length place - margin(place)/slope, at least 0, and goes slightly beyond the surface
+            of a comparison. Its derivative is that of the event's time by the implicit function theorem: the margin at
+            the end of an attempt carries the derivative
     refine  for second derivatives: one more attempt of the located length. The margin at its end gives one more Newton
             step, which doubles the order of the derivative
     refresh a step of length 0 evaluates the rates after an event, or within the mode beyond a switching surface. In a
@@ -72,7 +73,8 @@ class RunStatus(enum.IntEnum):
         EXHAUSTED: The run is over because its attempts are too many.
         MISSED: The run is over because its landing misses the stop, or its start is beyond the stop.
         REFUSED: The run was not accepted, and over from the beginning.
-        SLID: The run is over because it slides along a switching surface; only with `WatchedModes`.
+        SLID: The run is over because it slides along a switching surface and does not follow it; only with adaptive
+            steps or `WatchedModes`.
         GRAZED: The run is over because a margin only touches zero; only with `WatchedModes`.
     """
 

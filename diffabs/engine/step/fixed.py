@@ -4,8 +4,9 @@ A step goes to the next instant of the grid. If an event lies within it, shorter
 the event (`event_location`). The next step goes on to the grid.
 
 Steps keep to a mode if switching surfaces are located. A search on a switching surface may fail, or its mode may lead
-to invalid numbers. Then the step is unrestricted: it goes to the grid, and each stage evaluates its comparisons. It is
-accurate to the order of the kink. Later steps are unrestricted, too, until no comparison changes in one of them.
+to invalid numbers. With `WatchedModes` the run is then over. Otherwise the step is unrestricted: it goes to the grid,
+and each stage evaluates its comparisons. It is accurate to the order of the kink. Later steps are unrestricted, too,
+until no comparison changes in one of them.
 """
 
 import dataclasses
@@ -72,7 +73,8 @@ class FixedStepping:
     Attributes:
         h: Length of a step [s].
         steps: Number of steps.
-        switches: What they do about switches. None keeps modes for derivatives, and if a rate jumps at a surface.
+        switches: What they do about switches. None is not chosen yet: modes are kept for derivatives, and for values
+            if a rate jumps at a surface.
         second_order: True if the times of events have second derivatives.
     """
 
@@ -153,7 +155,7 @@ class FixedStepping:
         return steps + SPARE_ATTEMPTS + about + about // 3
 
     def is_calm(self, carry: Carry) -> Bool:
-        """Return True if the attempt of `carry` is no short rest of a step."""
+        """Return True if the attempt of `carry` is longer than a short rest of a step."""
         return carry.length > CALM_STEP_FRACTION * self.h
 
     def propose(self, system: ObservedSystem, carry: Carry) -> StepRequest:
@@ -272,7 +274,7 @@ def _is_plausible(carry: Carry, attempt: Attempt) -> Bool:
     """Return True if the state has changed roughly as the rates at both ends predict."""
     ends = [jax.tree.leaves(point.state.flow()) for point in (carry.point, attempt.point)]
     rates = [jax.tree.leaves(point.rates[0]) for point in (carry.point, attempt.point)]
-    # A flow within a mode need not be bounded beyond its kinks, unlike the loop's own flow. A step too long for
+    # A flow within a mode need not be bounded beyond its kinks, unlike the system's own flow. A step too long for
     # stability goes there.
     sane = []
     for a, b, p, q in zip(*ends, *rates, strict=True):

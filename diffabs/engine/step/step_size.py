@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from diffabs.core.numerics import clamp
-from diffabs.core.types import Array, Int, PyTree, Scalar, Vector
+from diffabs.core.types import Array, Int, PyTree, Scalar
 from diffabs.engine.hybrid import HybridSample, HybridState, HybridSystem
 
 INITIAL_STEP_S = 1e-4  # s, the first step
@@ -34,9 +34,11 @@ def error_scales(state: HybridState, sample: HybridSample) -> PyTree:
 
 
 def error_norm(
-    hybrid: HybridSystem, state: HybridState, state_errors: Scalar, scale: Scalar, sample: HybridSample
+    hybrid: HybridSystem, state: HybridState, state_errors: PyTree, scale: PyTree, sample: HybridSample
 ) -> Array:
     """Return the greatest error of all states and of the `error_controlled_signals`, as a fraction of their scales.
+
+    A scale of 0 counts as 1; there is no other absolute tolerance.
 
     The errors of the states lie in the middle of the step. The signals are evaluated with them at the end of the
     step, as an approximation.
@@ -76,7 +78,7 @@ def shortest_step(t: Array) -> Scalar:
     return jnp.maximum(MIN_STEP_EPS * number.eps * jnp.abs(t), number.tiny / number.eps)
 
 
-def spectral_step_limit(hybrid: HybridSystem, t: Array, state: HybridState, scale: Vector) -> Scalar:
+def spectral_step_limit(hybrid: HybridSystem, t: Array, state: HybridState, scale: PyTree) -> Scalar:
     """Return the stability limit of a step, 3/rho [s], with an estimate rho of the spectral radius of the flow's
     Jacobian.
 

@@ -5,7 +5,8 @@
     KeptModes      switching surfaces are located, too, and a step keeps to its mode
     WatchedModes   turns of all margins are looked for, too; a run that slides or grazes is over
 
-Each rule adds to the one before it. `Replayed` is the rule of a log, which has all decisions.
+Each is a subclass of the one before and replaces a part of it. `Replayed` is the rule of a log, which has all
+decisions.
 """
 
 import dataclasses
@@ -159,7 +160,7 @@ class ModeGuard(NamedTuple):
         fails: True if a search for a switching surface is given up.
         unrestricted: True if the next step has no mode.
         abandons: True if the next attempt is a regular one, in place of the attempt that had a mode.
-        slides: True if the run is over, because it slides.
+        slides: True if the run is over as SLID: it slides, or no surface can be located.
     """
 
     fails: Bool
@@ -183,8 +184,8 @@ class NextAttempt(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Replayed:
-    """A log says where steps end, and in which modes.
+class SwitchRule:
+    """What a stepping method does about switches.
 
     Attributes:
         isolates: True if the parts of a step are programs of their own: many expressions use their results.
@@ -210,7 +211,12 @@ class Replayed:
 
 
 @dataclasses.dataclass(frozen=True)
-class Unswitched(Replayed):
+class Replayed(SwitchRule):
+    """A log says where steps end, and in which modes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Unswitched(SwitchRule):
     """Nothing switches, and no event can happen."""
 
     isolates = False
@@ -439,8 +445,8 @@ class WatchedModes(KeptModes):
     def guard(self, judged: Judged, after: Carry, strain: Strain) -> ModeGuard:
         # Just before a surface that the run comes to with rate 0, each step may be too long for its mode: the square
         # root of a level. One step without a mode goes there. If the level stays, so does the run.
-        fails, slides, abandons = self._leave_mode(judged, after, strain)
-        return ModeGuard(fails, jnp.logical_and(strain.stuck, ~judged.carry.unrestricted), abandons, slides)
+        fails, leaves, abandons = self._leave_mode(judged, after, strain)
+        return ModeGuard(fails, jnp.logical_and(strain.stuck, ~judged.carry.unrestricted), abandons, leaves)
 
     def resume(self, plan: NextAttempt, regular: Scalar, carry: Carry, guard: ModeGuard) -> NextAttempt:
         # A step without a mode goes as far as the one that failed.

@@ -1,8 +1,8 @@
 """The dynamics of a system and its objectives, as one function of time and state.
 
 Fixed steps evaluate the parts directly, unless switching surfaces are located. All other runs trace a program whose
-comparisons are visible (`comparisons`). Fixed steps on this program freeze a mode, and so do adaptive steps that are
-logged or replayed. Without a mode, the derivative of a step places a kink up to one step too early or too late.
+comparisons are visible (`comparisons`). On this program steps freeze a mode if their rule `keeps_mode`, or if they are
+replayed. Without a mode, the derivative of a step places a kink up to one step too early or too late.
 """
 
 from collections.abc import Callable
