@@ -184,7 +184,8 @@ class AdaptiveStepping:
     rtol: AnyArray
     switches: Any = FREE_MODES
     stable: bool = True
-    tableau, has_margin_rates, shows_comparisons, second_order = TSIT5, True, True, False
+    tableau, has_margin_rates, second_order = TSIT5, True, False
+    shows_comparisons = True
     step = advance
 
     @property

@@ -108,7 +108,8 @@ class ReplayStepping:
     live: AdaptiveStepping
     entry: Any = None
     switches = Replayed()
-    tableau, has_margin_rates, shows_comparisons, second_order = TSIT5, True, True, False
+    tableau, has_margin_rates, second_order = TSIT5, True, False
+    shows_comparisons = True
 
     @property
     def h(self) -> Array:

@@ -11,7 +11,7 @@ decisions.
 
 import dataclasses
 from functools import reduce
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -194,7 +194,10 @@ class SwitchRule:
         follows: True if a run follows the surfaces along which it slides.
     """
 
-    isolates, keeps_mode, watches, follows = True, False, False, False
+    isolates: ClassVar[bool] = True
+    keeps_mode: ClassVar[bool] = False
+    watches: ClassVar[bool] = False
+    follows: bool = False
 
     def start_watch(self, system: ObservedSystem, t: Scalar) -> SlideWatch | tuple[()]:
         """Return the watch for slides of a run that starts at `t` [s]; () for none."""
@@ -219,7 +222,7 @@ class Replayed(SwitchRule):
 class Unswitched(SwitchRule):
     """Nothing switches, and no event can happen."""
 
-    isolates = False
+    isolates: ClassVar[bool] = False
 
     def propose(self, system: ObservedSystem, carry: Carry, grid: Array, strike: Int) -> StepRequest:
         """Return the step to attempt next; `strike` is the number of the next instant of a clock, or of the end."""
@@ -273,7 +276,7 @@ class Unswitched(SwitchRule):
 class FreeModes(Unswitched):
     """Events are located, and each stage evaluates its comparisons."""
 
-    isolates = True
+    isolates: ClassVar[bool] = True
 
     def start_watch(self, system: ObservedSystem, t: Scalar) -> SlideWatch | tuple[()]:
         if not system.bit_count:
@@ -372,8 +375,7 @@ class FreeModes(Unswitched):
 class KeptModes(FreeModes):
     """Switching surfaces are located like events, and a step keeps to its mode."""
 
-    follows: bool = False
-    keeps_mode = True
+    keeps_mode: ClassVar[bool] = True
 
     def forecast(self, horizon: Horizon, dynamics: Evaluation) -> PyTree:
         ahead = forecast_crossing(dynamics.surfaces, horizon.natural, horizon.shortest)
@@ -435,7 +437,7 @@ class KeptModes(FreeModes):
 class WatchedModes(KeptModes):
     """Turns of all margins are looked for, and a run that slides or grazes is over."""
 
-    watches = True
+    watches: ClassVar[bool] = True
 
     def find(self, system: ObservedSystem, carry: Carry, trial: Trial) -> Findings:
         h, dynamics, state, _, error, resolved = trial
@@ -461,7 +463,9 @@ class WatchedModes(KeptModes):
         return dynamics
 
 
-UNSWITCHED, FREE_MODES, KEPT_MODES = Unswitched(), FreeModes(), KeptModes()
+UNSWITCHED: Unswitched = Unswitched()
+FREE_MODES: FreeModes = FreeModes()
+KEPT_MODES: KeptModes = KeptModes()
 
 
 def _propose(carry: Carry, grid: Array, strike: Int, mode: Mode, refresh: Bool) -> StepRequest:
