@@ -10,6 +10,7 @@ from project import ROOT
 from experiments._shared import numbers
 
 STUDIES = ROOT / "experiments"
+SHORTER = "shorter than the paper's [%]"
 QUICK = {  # parts that take up to three minutes each on an idle machine; the others take up to hours
     "lab_rig": {"": "run"},
     "mean_intervals": {"": "run"},
@@ -105,6 +106,24 @@ def distances_over_roads(tables):
     return printed
 
 
+def distances_above_the_bound(tables):
+    rows = {row["rule"]: row for row in tables["exact sensors"]["table"]}
+    kinds = {row["rule"]: row for row in tables["exact sensors"]["by road"]}
+    printed = {}
+    for name in ("tuned, latch", "tuned, robust latch", "tuned, fixed slip"):
+        row, kind = rows[name], kinds[name]
+        one, less, more = kind["one surface"], kind["with an edge, to less friction"], kind["with an edge, to more"]
+        printed[name] = [
+            f"{row['above the bound [%]']:.2f} +- {row['+- [%]']:.2f}",
+            f"{row['median [%]']:.2f}, {row['95 % of them [%]']:.1f}",
+            f"{row[SHORTER]:.2f} +- {row['+- of that [%]']:.2f}",
+            str(row["not stopped"]),
+            f"{one:.2f}" if one < 1 else f"{one:.1f}",
+            f"{less:.1f}, {more:.1f}",
+        ]
+    return printed
+
+
 def overshoots_at_weak_spots(tables):
     names = {"published gain": "published gain", "LMI, k1 as published": "LMI, same k1", "**tuned**": "the cure"}
     rows = {row["controller"]: row for row in tables["weak_spots"]}
@@ -148,6 +167,7 @@ def recovered_by_weights(tables):
 @pytest.mark.parametrize(
     ("name", "printed"),
     [
+        ("best_slip", distances_above_the_bound),
         ("lab_rig", critical_lags),
         ("mean_intervals", coverages),
         ("slip_estimator", distances_behind_an_edge),
