@@ -57,6 +57,19 @@ def public_functions(path):
                 yield from ((one, f"{node.name}.") for one in inner)
 
 
+def described_in_a_base(path):
+    """Return "Class.method" of each method whose text stands in a base class of the same module, as `help` shows it."""
+    tree = ast.parse((HOME / path).read_text(encoding="utf-8"))
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+
+    def methods_with_text(name):
+        bases = [methods_with_text(base.id) for base in classes[name].bases if getattr(base, "id", "") in classes]
+        methods = [node for node in classes[name].body if isinstance(node, ast.FunctionDef)]
+        return set().union(*bases) | {method.name for method in methods if ast.get_docstring(method)}
+
+    return {f"{name}.{method}" for name in classes for method in methods_with_text(name)}
+
+
 @functools.cache
 def contract_methods():
     """Return the names of the methods that contracts describe, in protocols.py: parts need not say it again."""
@@ -70,11 +83,12 @@ def contract_methods():
 @pytest.mark.parametrize("path", FILES)
 def test_a_docstring_begins_with_a_sentence(path):
     """Of a function with a verb, of a property or a class with a noun."""
-    contract = contract_methods()
+    contract, inherited = contract_methods(), described_in_a_base(path)
     for node, owner in public_functions(path):
         text = ast.get_docstring(node) or ""
         decorators = " ".join(map(ast.unparse, getattr(node, "decorator_list", [])))
-        if not text and ((owner and node.name in contract) or "overload" in decorators):
+        described = (owner and node.name in contract) or owner + node.name in inherited
+        if not text and (described or "overload" in decorators):
             continue
         assert re.search(r"[.:;]($|\s)", text.split("\n\n")[0]), owner + node.name
         if isinstance(node, ast.FunctionDef) and "property" not in decorators and not (owner and node.name in contract):
