@@ -47,9 +47,10 @@ class SolutionStatus(enum.IntEnum):
     Attributes:
         FINISHED: It reached t1.
         TERMINATED: A terminal event ended it.
-        DIVERGED: A number is not finite, no step meets its tolerance, or the steps would be too many.
+        DIVERGED: A number is not finite, no step meets its tolerance, or the steps would be too many; with fixed steps
+            also if a rate runs away within a step.
         SLID: It slides along a switching surface of the field, or crosses surfaces ever faster; with fixed steps also
-            if a field with switches or events has numbers that are not finite, or change too fast for a step.
+            if a step is too long for the field beyond a surface.
         CROWDED: Events follow each other without end, as the bounces of a ball that comes to rest, or where a reset
             sets its own condition to zero and it falls.
         GRAZED: A switching surface or the zero of a condition is only touched, or a condition jumps.

@@ -270,8 +270,8 @@ def _finish_solution(system: FieldSystem, objectives: dict[str, Saves], carry: P
     status: Scalar = jnp.asarray(SolutionStatus.DIVERGED.value)
     for run_status, meant in statuses.items():
         status = jnp.where(carry.status == run_status, meant.value, status)
-    # A fault of an event ends the run by rates that are NaN. Fixed steps then leave their mode, as in a slide.
-    lost: Scalar = ((status == SolutionStatus.DIVERGED) | (status == SolutionStatus.SLID)) & (held.fault > 0)
+    # A fault of an event ends the run by rates that are NaN.
+    lost: Scalar = (status == SolutionStatus.DIVERGED) & (held.fault > 0)
     status = jnp.where(lost, held.fault.astype(status.dtype), status)
     check = partial(invalidate, invalid=status > SolutionStatus.TERMINATED, inputs=system.inputs)
     # The sum of the steps of a grid may miss t1 by its rounding.

@@ -262,6 +262,30 @@ def test_a_slide_is_reported(solver):
 
 
 @pytest.mark.slow
+@killed_by(
+    "engine.step.fixed",
+    "leaves=decision.valid & carry.unrestricted if self.switches.watches else False",
+    "leaves=jnp.logical_not(decision.valid)",
+    case="exponential",
+)
+@killed_by("engine.step.fixed", "grazes & _outruns_step(carry, attempt)", "False", case="pole")
+@pytest.mark.parametrize(
+    "field",
+    [
+        lambda t, y, level: jnp.where(y > level, 1.0, 2.0) * y**2,
+        lambda t, y, level: jnp.where(t > level, 1.0, 2.0) * jnp.exp(y),
+        lambda t, y, level: jnp.where(t > level, 1.0, 2.0) * -1e3 * y,  # ten times too stiff for the step
+    ],
+    ids=["pole", "exponential", "stiff"],
+)
+def test_numbers_without_bound_diverge_with_fixed_steps(field):
+    solver = d.FixedStep(1e-2)
+    found = jax.jit(lambda level: d.solve(field, 0.3, 0.0, 3.0, level, solver=solver, engine="xla"))(0.5)
+    assert found.status == SolutionStatus.DIVERGED
+    assert np.isnan(found.y)
+
+
+@pytest.mark.slow
 @killed_by("engine.step.switching", "jnp.where(resolved, margin_error(system, carry, h, dynamics, state), 0.0)", "0.0")
 def test_a_touch_is_reported_and_a_short_crossing_is_found():
     def final(level):

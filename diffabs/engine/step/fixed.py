@@ -4,9 +4,10 @@ A step goes to the next instant of the grid. If an event lies within it, shorter
 the event (`event_location`). The next step goes on to the grid.
 
 Steps keep to a mode if switching surfaces are located. A search on a switching surface may fail, or its mode may lead
-to invalid numbers. With `WatchedModes` the run is then over. Otherwise the step is unrestricted: it goes to the grid,
-and each stage evaluates its comparisons. It is accurate to the order of the kink. Later steps are unrestricted, too,
-until no comparison changes in one of them.
+to invalid numbers. Then the step is unrestricted: it goes to the grid, and each stage evaluates its comparisons. It is
+accurate to the order of the kink. Later steps are unrestricted, too, until no comparison changes in one of them. With
+`WatchedModes` a failed search ends the run, and so does the unrestricted step: SLID, or DIVERGED if its numbers are
+invalid, too.
 """
 
 import dataclasses
@@ -35,6 +36,7 @@ MAX_ATTEMPTS_PER_STEP = 32  # attempts within one step of the grid, as a multipl
 CALM_STEP_FRACTION = 0.02  # of a step of the grid: after a longer step without a landing, a run does not slide
 # Greatest change of a state in a step: a multiple of the rates at both ends, plus a fraction of the state.
 MAX_RATE_RATIO, MAX_STATE_FRACTION = 4, 1e-3
+MAX_END_RATE_RATIO = 3  # Greatest rate at the end of a step: a multiple of the rate at its start plus the mean rate
 
 
 class FixedStepControl(NamedTuple):
@@ -203,6 +205,7 @@ class FixedStepping:
             if self.switches.watches:
                 grazes = attempt.report.grazes & (decision.accepted | decision.searches)
                 status = self.switches.judge(status, guard.slides, grazes, after)
+                lost |= grazes & _outruns_step(carry, attempt)
         max_extra = (EVENT_ATTEMPTS_PER_STEP + self.crossing_attempts) * self.steps + SPARE_ATTEMPTS
         status = jnp.where(extra > max_extra, RunStatus.EXHAUSTED, status)
         strikes = status == RunStatus.RUNNING
@@ -222,9 +225,10 @@ class FixedStepping:
         crowded = control.in_step >= self.crossing_attempts * MAX_ATTEMPTS_PER_STEP
         strain = Strain(
             crowded=crowded | (control.extra > self.crossing_attempts * carry.k + SPARE_ATTEMPTS),
-            leaves=jnp.logical_not(decision.valid),
+            # Without its mode the numbers are valid: a surface is in the way that could not be located.
+            leaves=decision.valid & carry.unrestricted if self.switches.watches else False,
             calm=calm,
-            stuck=False,
+            stuck=jnp.logical_not(decision.valid),
         )
         guard = self.switches.guard(judged, after, strain)
         if watch := after.slides:
@@ -281,3 +285,17 @@ def _is_plausible(carry: Carry, attempt: Attempt) -> Bool:
         from_rates = MAX_RATE_RATIO * jnp.abs(carry.length) * jnp.maximum(jnp.abs(p), jnp.abs(q))
         sane.append(jnp.all(jnp.abs(b - a) <= from_rates + MAX_STATE_FRACTION * (jnp.abs(a) + jnp.abs(b))))
     return jnp.all(jnp.array(sane))
+
+
+def _outruns_step(carry: Carry, attempt: Attempt) -> Bool:
+    """Return True if the rates at the end are far beyond those that the start and the step explain.
+
+    The trapezoidal rule allows twice the change of the state plus the rate at the start.
+    """
+    ends = [jax.tree.leaves(point.state.flow()) for point in (carry.point, attempt.point)]
+    rates = [jax.tree.leaves(point.rates[0]) for point in (carry.point, attempt.point)]
+    outruns = [
+        jnp.any(jnp.abs(carry.length * q) > MAX_END_RATE_RATIO * (jnp.abs(b - a) + jnp.abs(carry.length * p)))
+        for a, b, p, q in zip(*ends, *rates, strict=True)
+    ]
+    return jnp.any(jnp.array(outruns))

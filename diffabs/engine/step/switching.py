@@ -125,7 +125,7 @@ class Strain(NamedTuple):
         crowded: True if searches for switching surfaces take too many attempts.
         leaves: True if the next steps should have no mode, for another reason.
         calm: True for a regular step.
-        stuck: True if no step is short enough for its mode, in a run that is watched.
+        stuck: True if no step is short enough for its mode: one without a mode is attempted.
     """
 
     crowded: Bool
@@ -408,7 +408,7 @@ class KeptModes(FreeModes):
         system, carry, _, decision = judged
         tries = after.search.tries >= MAX_LOCATION_ATTEMPTS
         fails = (strain.crowded | tries) & decision.searches & (after.search.number < system.bit_count)
-        leaves = fails | strain.leaves
+        leaves = fails | strain.leaves | strain.stuck
         return fails, leaves, jnp.logical_and(leaves, ~carry.unrestricted) & ~decision.accepted
 
     def _mode_of_step(self, system: ObservedSystem, carry: Carry, refresh: Bool) -> Mode:
@@ -447,13 +447,14 @@ class WatchedModes(KeptModes):
     def guard(self, judged: Judged, after: Carry, strain: Strain) -> ModeGuard:
         # Just before a surface that the run comes to with rate 0, each step may be too long for its mode: the square
         # root of a level. One step without a mode goes there. If the level stays, so does the run.
-        fails, leaves, abandons = self._leave_mode(judged, after, strain)
-        return ModeGuard(fails, jnp.logical_and(strain.stuck, ~judged.carry.unrestricted), abandons, leaves)
+        fails, _, abandons = self._leave_mode(judged, after, strain)
+        unrestricted = jnp.logical_and(strain.stuck, ~judged.carry.unrestricted)
+        return ModeGuard(fails, unrestricted, abandons, fails | strain.leaves)
 
     def resume(self, plan: NextAttempt, regular: Scalar, carry: Carry, guard: ModeGuard) -> NextAttempt:
         # A step without a mode goes as far as the one that failed.
-        length = jnp.where(guard.unrestricted, carry.length, plan.length)
-        return super().resume(plan._replace(length=length), regular, carry, guard)
+        plan = super().resume(plan, regular, carry, guard)
+        return plan._replace(length=jnp.where(guard.unrestricted, carry.length, plan.length))
 
     def judge(self, status: Scalar, slides: Bool, grazes: Bool, after: Carry) -> Scalar:
         del after
