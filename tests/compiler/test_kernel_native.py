@@ -172,6 +172,7 @@ RULES = {
     "part": lambda x, y, k: jax.lax.dynamic_slice(x * jnp.arange(5.0), (k,), (2,)),
     "written": lambda x, y, k: jnp.zeros(4).at[k].set(x),
     "rows written": lambda x, y, k: jnp.zeros((3, 2)).at[k].set(jnp.stack([x, y])),
+    "added": lambda x, y, k: (jnp.arange(4.0) * y).at[k].add(x),
     "part written": lambda x, y, k: jax.lax.dynamic_update_slice(jnp.zeros(5), jnp.stack([x, y]), (k,)),
     "either way": lambda x, y, k: jax.lax.cond(x > y, lambda: jnp.sin(x) + y, lambda: x * y),
     "one of three": lambda x, y, k: jax.lax.switch(k, [lambda: x, lambda: y, lambda: x * y]),

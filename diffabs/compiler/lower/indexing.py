@@ -91,9 +91,11 @@ def _dynamic_update(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[N
     return [out]
 
 
-@lowering_rule("scatter", "dimension_numbers indices_are_sorted mode unique_indices update_consts update_jaxpr")
+@lowering_rule(
+    "scatter scatter-add", "dimension_numbers indices_are_sorted mode unique_indices update_consts update_jaxpr"
+)
 def _scatter(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray]:
-    """Return x.at[i].set(value) for one index i along the first axis.
+    """Return x.at[i].set(value) or x.at[i].add(value) for one index i along the first axis.
 
     An index outside of the array changes nothing, or is clamped in the mode CLIP.
     """
@@ -101,19 +103,22 @@ def _scatter(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArra
     n = eqn.params["dimension_numbers"]
     whole = n.update_window_dims == tuple(range(x.ndim - 1)) and n.inserted_window_dims == (0,)
     if not whole or n.scatter_dims_to_operand_dims != (0,) or n.operand_batching_dims or places.size != 1:
-        raise Unsupported("scatter", f"with {n}")
+        raise Unsupported(eqn.primitive.name, f"with {n}")
     mode = str(eqn.params["mode"]).rsplit(".", 1)[-1]
     if mode not in ("FILL_OR_DROP", "PROMISE_IN_BOUNDS", "CLIP"):
-        raise Unsupported("scatter", f"with the mode {mode}")
+        raise Unsupported(eqn.primitive.name, f"with the mode {mode}")
     _check_writable(eqn, len(x))
     index, out = places.ravel()[0], np.empty(x.shape, object)
     # Without the clamp, an index outside matches no entry, so the array stays, as FILL_OR_DROP demands.
     index = _clamp_index(graph, index, len(x) - 1) if mode == "CLIP" else index
+    adds = eqn.primitive.name == "scatter-add"
     for i in range(len(x)):
         hit = graph.op("eq", index, graph.const(i, index.dtype))
-        out[i, ...] = map_entries(
-            lambda a, b, hit=hit: graph.select(hit, a, b), as_node_array(x[i]), new.reshape(x.shape[1:])
-        )
+
+        def write(old: Node, new: Node, hit: Node = hit) -> Node:
+            return graph.select(hit, old, graph.op("add", old, new) if adds else new)
+
+        out[i, ...] = map_entries(write, as_node_array(x[i]), new.reshape(x.shape[1:]))
     return [out]
 
 
