@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 from marks import cases
 from mutants import killed_by
-from parts import BLOCKS, PARTS, PLANTS, ROADS, differences, jacobian, leaves, struct, value
+from parts import BLOCKS, PARTS, PLANTS, ROADS, WITH_CHANNELS, differences, jacobian, leaves, struct, value
 
 from diffabs.core import protocols
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, Tracking
@@ -22,7 +22,12 @@ from diffabs.core.pytree import canonical_dtypes, get, parameters, replace
 from diffabs.core.validity import check_part
 from diffabs.parts.plants import BrakeStart
 
-EVERY = [pytest.param(family, part, id=f"{family}: {name}") for family in PARTS for name, part in PARTS[family].items()]
+EVERY = [
+    pytest.param(family, part, id=f"{family}: {name}")
+    for family_parts in (PARTS, WITH_CHANNELS)
+    for family in family_parts
+    for name, part in family_parts[family].items()
+]
 # of the families that have no Protocol
 SIGNATURES = {"initial": {}, "antiwindup": {"rate": ["self", "error", "gain", "raw", "limited"]}}
 

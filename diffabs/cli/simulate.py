@@ -113,5 +113,5 @@ def _judge(scenario: Scenario, result: JsonObject, slides: str) -> None:
 def _draw(scenario: Scenario, run: Run, picture: pathlib.Path) -> None:
     from diffabs.output.plot import draw_run
 
-    unit = scenario.loop.plant.control_unit
+    unit = getattr(scenario.loop.plant, "control_unit", "")
     draw_run(run, title=scenario.title or scenario.name, unit=unit).savefig(picture)

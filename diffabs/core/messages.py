@@ -3,7 +3,9 @@
 `core.protocols`, the page of contracts, re-exports these names.
 """
 
+from collections import namedtuple
 from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
@@ -102,35 +104,57 @@ class Clock(NamedTuple):
 
 
 class Tracking(NamedTuple):
-    """The input of a controller: target (a slip, an angle), measured output, and feed-forward input."""
+    """The input of a controller: target (a slip, an angle), measured output, and feed-forward input.
 
-    target: Scalar
+    Target and feed-forward are numbers, or NamedTuples in a loop with several inputs (`core.channels`).
+    """
+
+    target: Any
     measured: PyTree
-    feedforward: Scalar
+    feedforward: Any
 
 
 class Sample(NamedTuple):
-    """The signals of a run at an instant; the input of an objective."""
+    """The signals of a run at an instant; the input of an objective.
+
+    All but time and output are numbers, or NamedTuples in a loop with several inputs (`core.channels`).
+    """
 
     t: Scalar  # [s]
     output: PyTree  # true outputs of the plant, not the measurement
-    target: Scalar  # present target of the controller, in the unit of the first output
-    setpoint: Scalar  # final value of the target
-    feedforward: Scalar  # in the unit of the control
-    command: Scalar  # output of the controller
-    control: Scalar  # output of the actuator
+    target: Any  # present target of the controller, in the unit of the first output
+    setpoint: Any  # final value of the target
+    feedforward: Any  # in the unit of the control
+    command: Any  # output of the controller
+    control: Any  # output of the actuator
 
     def show(self) -> "Shown":
         """Return outputs and setpoint."""
         return Shown(self.output, self.setpoint)
 
-    def error_controlled_signals(self) -> Scalar:
-        """Return the first output, whose error limits an adaptive step."""
-        return self.output[0]
+    def error_controlled_signals(self) -> PyTree:
+        """Return the outputs that have a target, whose errors limit an adaptive step."""
+        return tracked_outputs(self.output)
 
-    def signal_scales(self) -> Scalar:
-        """Return the greater one of |first output| and |setpoint|."""
-        return jnp.maximum(jnp.abs(self.output[0]), jnp.abs(self.setpoint))
+    def signal_scales(self) -> PyTree:
+        """Return the greater one of |output| and |setpoint| for each of them."""
+        tracked = tracked_outputs(self.output)
+        if not hasattr(self.setpoint, "_fields"):
+            return jnp.maximum(jnp.abs(tracked), jnp.abs(self.setpoint))
+        setpoints = (getattr(self.setpoint, name) for name in tracked._fields)
+        return type(tracked)(*(jnp.maximum(jnp.abs(y), jnp.abs(r)) for y, r in zip(tracked, setpoints, strict=True)))
+
+
+@cache
+def named_tuple(name: str, fields: tuple[str, ...]) -> Any:
+    """Return the NamedTuple with these fields; the same class every time, because JAX compares the classes of trees."""
+    return namedtuple(name, fields)
+
+
+def tracked_outputs(output: PyTree) -> PyTree:
+    """Return the outputs that have a target: the first one, or those named by `tracked` of the output's type."""
+    names = getattr(type(output), "tracked", None)
+    return output[0] if names is None else named_tuple("Tracked", names)(*(getattr(output, name) for name in names))
 
 
 class Ending(NamedTuple):
@@ -154,7 +178,7 @@ class Shown(NamedTuple):
     """The plant outputs and the setpoint of the first output, or their rates."""
 
     output: PyTree
-    setpoint: Scalar
+    setpoint: Any
 
     def show(self) -> "Shown":
         """Return all of it."""

@@ -20,6 +20,10 @@ A plant declares its outputs, a NamedTuple of signals with their `units`: a `Bra
 one. The target refers to the first output. `loop/contracts` checks a loop before its first run. It refuses a part
 that returns something else than its contract says, or that reads an output which the plant lacks.
 
+A plant with several inputs declares them as `controls`, another such NamedTuple. Its type of outputs names in `tracked`
+those that have a target. Control, command and feed-forward then have the type `controls`; target and setpoint have a
+field for each tracked output (`core.channels`).
+
 Optional methods or attributes of a part's class, beyond its contract:
 
     of             offer                                purpose
@@ -43,7 +47,10 @@ Optional methods or attributes of a part's class, beyond its contract:
                    audit(initial)                       an objective that exceeds 1 in a physically impossible run
                    probes(initial, setpoint, stop)      starts (k,) at which its loop may be stiffest
                    frozen = ("speed", ...)              outputs that a linear model of its first output holds constant
+                   controls                             NamedTuple with `units` of several inputs, for `control_unit`
     output         highest                              greatest possible value of the first output
+                   tracked = ("level_1", ...)           outputs that have a target, instead of the first one
+                   channel(name), with_channel(...)     the outputs that a part for one channel sees, and back
     stop           otherwise = "..."                    note to the reader on a run that ended without success
     objective      physical = (low, high)               range of the value of a physically possible run
                    failure = 0.0                        a run with a greater value has failed
@@ -97,7 +104,7 @@ class Plant(Protocol):
 
     @property
     def control_unit(self) -> str:
-        """Unit of the control: "N m", "V", or "1" for a command; a class attribute."""
+        """Unit of the control: "N m", "V", or "1" for a command; a class attribute, not of a plant with `controls`."""
         ...
 
     def start(self, initial: Part) -> PyTree:

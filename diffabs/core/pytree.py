@@ -5,7 +5,7 @@ to a controller is tuning. A second dictionary of parameters does not exist. A f
 
     param(...)   a leaf: a float (or array), with unit and range; differentiable and batchable. A string below says
                  what it means
-    part(...)    another part, or a tuple of parts
+    part(...)    another part, or a tuple of parts; with `named` also parts by name, whose paths lack the field's name
     static(...)  a shape or a choice fixed at trace time
 
 The construction of a part does not check ranges, because JAX rebuilds parts with tracers and placeholders.
@@ -125,12 +125,17 @@ def param(
     return dataclasses.field(default=default, metadata={"spec": spec})
 
 
-def part(*, default: object = dataclasses.MISSING) -> Any:
-    """Return a field that holds another part, or a tuple or list of parts; a default that is a class is called."""
+def part(*, default: object = dataclasses.MISSING, named: bool = False) -> Any:
+    """Return a field that holds another part, or a tuple or list of parts; a default that is a class is called.
+
+    Args:
+        named: Whether the field may also hold a dictionary of parts. The path of each is its key, beside the fields.
+    """
+    metadata = {"part": True, "named": named}
     if default is dataclasses.MISSING:
-        return dataclasses.field(metadata={"part": True})
+        return dataclasses.field(metadata=metadata)
     make = default if isinstance(default, type) else lambda: default
-    return dataclasses.field(default_factory=make, metadata={"part": True})
+    return dataclasses.field(default_factory=make, metadata=metadata)
 
 
 def static(*, default: object = dataclasses.MISSING) -> Any:
@@ -201,7 +206,8 @@ def parameters(
 def children(part: object, prefix: str) -> Iterator[tuple[str, dataclasses.Field[PyTree] | None, PyTree]]:
     """Yield (dotted path, field, value) of each field that is not static, without descending into the values.
 
-    For a tuple or a list of parts it yields the items, with None as their field. For any other value it yields nothing.
+    For a tuple or a list of parts it yields the items, with None as their field; so it does for parts by name. For any
+    other value it yields nothing.
     """
     if isinstance(part, type):
         name = prefix.removesuffix(".") or "the part"
@@ -211,8 +217,11 @@ def children(part: object, prefix: str) -> Iterator[tuple[str, dataclasses.Field
             yield f"{prefix}{i}", None, item
     elif dataclasses.is_dataclass(part):
         for field in dataclasses.fields(part):
-            if "static" not in field.metadata:
-                yield prefix + field.name, field, getattr(part, field.name)
+            value = getattr(part, field.name)
+            if isinstance(value, dict) and field.metadata.get("named"):
+                yield from ((prefix + name, None, item) for name, item in value.items())
+            elif "static" not in field.metadata:
+                yield prefix + field.name, field, value
 
 
 def parts(part: object) -> Iterator[PyTree]:
@@ -246,8 +255,19 @@ def get(part: Part, path: str) -> PyTree:
             new = current_name(name, names)
             hint = f"it is now {new}" if new else f"there is {', '.join(names) or 'nothing'}"
             raise KeyError(f"no '{name}' in {path}; {hint}")
-        part = getattr(part, name) if dataclasses.is_dataclass(part) else part[int(name)]
+        part = _child(part, name) if dataclasses.is_dataclass(part) else part[int(name)]
     return part
+
+
+def _child(part: Part, name: str) -> Any:
+    """Return the value of a field, or the part of this name in a field of parts by name."""
+    return part_names(part)[name][name] if name in part_names(part) else getattr(part, name)
+
+
+def part_names(part: Part) -> dict[str, dict[str, Any]]:
+    """Return the field's value, a dictionary of parts, by the name of each part in it."""
+    values = [getattr(part, field.name) for field in dataclasses.fields(part) if field.metadata.get("named")]
+    return {name: value for value in values if isinstance(value, dict) for name in value}
 
 
 def _names(part: Part, prefix: str) -> list[str]:
@@ -295,7 +315,11 @@ def replace(part: T, values: Params) -> T:
 def _replace(part: Part, names: list[str], value: Scalar) -> Any:
     head, *tail = names
     if dataclasses.is_dataclass(part):
-        new = _replace(getattr(part, head), tail, value) if tail else value
+        new = _replace(_child(part, head), tail, value) if tail else value
+        for field in dataclasses.fields(part):
+            named = getattr(part, field.name)
+            if isinstance(named, dict) and head in named:
+                head, new = field.name, {**named, head: new}
         return dataclasses.replace(part, **{head: new})  # pyright: ignore[reportArgumentType]  # an instance
     i = int(head)
     new = _replace(part[i], tail, value) if tail else value
@@ -392,7 +416,13 @@ def _rebuild_parts(part: object, method: str, args: Callable[[str], tuple[PyTree
         return tuple(_rebuild_parts(item, method, args, f"{prefix}{i}.") for i, item in enumerate(part))
     if not dataclasses.is_dataclass(part):
         return part
+
+    def rebuild(name: str, value: object) -> PyTree:
+        if isinstance(value, dict):
+            return {key: _rebuild_parts(item, method, args, f"{prefix}{key}.") for key, item in value.items()}
+        return _rebuild_parts(value, method, args, f"{prefix}{name}.")
+
     fields = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
-    inner = {name: _rebuild_parts(getattr(part, name), method, args, f"{prefix}{name}.") for name in fields}
+    inner = {name: rebuild(name, getattr(part, name)) for name in fields}
     part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
     return getattr(part, method)(*args(prefix)) if hasattr(part, method) else part

@@ -8,6 +8,7 @@
 
 import functools
 import re
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from diffabs.core.types import Part
@@ -17,17 +18,51 @@ UNIT_FACTOR = re.compile(r"(/?)\s*([^\s/^]+)(?:\^(\d+))?")
 
 
 class Units(NamedTuple):
-    """The units for the words `control` and `signal` in a loop, and those of the plant's outputs as (name, unit)."""
+    """The units for the words `control` and `signal` in a loop; also of the plant's outputs and controls by name.
+
+    A word is empty, and stays in a unit, if the plant has several inputs of different units.
+    """
 
     control: str
     signal: str
     outputs: tuple[tuple[str, str], ...] = ()
+    controls: tuple[tuple[str, str], ...] = ()
+
+    def of_channel(self, control: str, output: str) -> "Units":
+        """Return the units inside a channel; an empty name keeps the word's unit."""
+        return self._replace(
+            control=dict(self.controls).get(control, self.control), signal=dict(self.outputs).get(output, self.signal)
+        )
+
+
+def control_units(plant: Part) -> dict[str, str]:
+    """Return the unit of each control by name; the name of a single one is "control"."""
+    controls = getattr(plant, "controls", None)
+    return {"control": plant.control_unit} if controls is None else dict(controls.units)
 
 
 def units_of(plant: Part) -> Units | None:
-    """Return the units of a plant's control and first output, or None if the plant declares none."""
+    """Return the units of a plant's controls and of the outputs with a target, or None if the plant declares none."""
     shown = getattr(getattr(plant, "shows", None), "units", None)
-    return Units(plant.control_unit, next(iter(shown.values())), tuple(shown.items())) if shown else None
+    if not shown:
+        return None
+    tracked = getattr(plant.shows, "tracked", None) or (next(iter(shown)),)
+    controls = control_units(plant)
+    control, signal = _common(controls.values()), _common(shown[name] for name in tracked)
+    return Units(control, signal, tuple(shown.items()), tuple(controls.items()))
+
+
+def _common(units: Iterable[str]) -> str:
+    """Return the unit, if all are the same, or else an empty text."""
+    first, *others = {*units}
+    return "" if others else first
+
+
+def channel_unit(unit: str, control: str, output: str) -> str:
+    """Return a relative unit whose words name a channel, "signal[level_1] s"; an empty name keeps the word."""
+    for word, name in (("control", control), ("signal", output)):
+        unit = re.sub(rf"\b{word}\b(?!\[)", f"{word}[{name}]" if name else word, unit)
+    return unit
 
 
 def units_inside(part: object, name: str, units: Units | None) -> Units | None:
@@ -45,6 +80,8 @@ def resolve_unit(unit: str, units: Units | None) -> str:
     if units is None or not RELATIVE_UNIT.search(unit):
         return unit
     meaning = {"control": units.control, "signal": units.signal}
+    meaning |= {f"control[{name}]": text for name, text in units.controls}
+    meaning |= {f"signal[{name}]": text for name, text in units.outputs}
     return ", ".join(_multiply_units(element, meaning) for element in unit.split(", "))
 
 
@@ -58,7 +95,7 @@ def insert_unit(text: str, units: Units | None) -> str:
     """Return a sentence with the units for ` {control}` and ` {signal}`; a unit that is unknown or 1 is left out."""
     for name in ("control", "signal"):
         unit = getattr(units, name, "1")
-        text = text.replace(f" {{{name}}}", "" if unit == "1" else f" {unit}")
+        text = text.replace(f" {{{name}}}", "" if unit in ("", "1") else f" {unit}")
     return text
 
 

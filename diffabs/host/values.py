@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from diffabs.core.channels import Channels
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.renamed import current_name
 from diffabs.core.types import Part, PyTree, Scalar
@@ -224,7 +225,14 @@ def _choice(value: object, path: str) -> float | str:
     return value if isinstance(value, str) else read_any_number(value, path)
 
 
+def _read_names(value: object, path: str) -> str | tuple[PyTree, ...]:
+    """Return a text, or texts in lists that are nested to any depth, as tuples."""
+    return list_reader(_read_names)(value, path) if isinstance(value, list | tuple) else read_text(value, path)
+
+
 READER_BY_TYPE: dict[PyTree, Reader] = {
+    tuple: list_reader(_read_names),
+    Channels: lambda table, path: Channels(table_reader(read_text, "an output for each control")(table, path)),
     float: read_any_number,
     bool: read_switch,
     str: read_text,
@@ -324,6 +332,9 @@ def plain_fields(part: Part, *, brief: bool = False) -> dict[str, PyTree]:
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
         if brief and field.default is not dataclasses.MISSING and as_plain(value) == as_plain(field.default):
+            continue
+        if field.metadata.get("named") and isinstance(value, dict):
+            values |= as_plain(value, brief=brief)
             continue
         values[field.name] = (
             np.asarray(value, float).tolist() if "spec" in field.metadata else as_plain(value, brief=brief)

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.blocks import offers
+from diffabs.core.blocks import innermost_blocks, offers
 from diffabs.core.protocols import Clock, Memory, Objective
 from diffabs.core.pytree import refine_parts
 from diffabs.core.types import Array, Bool, Int, Key, Part, PyTree, Scalar, Vector
@@ -133,9 +133,7 @@ def incomparability_reasons(loop: Loop, solver: Solver, key: Key | None = None) 
 def per_step_blocks(loop: Loop) -> Iterator[str]:
     """Yield the names of the blocks (such as "controller") that compute at every step instead of on a clock."""
     for name in BLOCKS:
-        block = getattr(loop, name)
-        inner = getattr(block, "blocks", (block,))
-        if any(getattr(part, "every_step", False) for part in inner):
+        if any(getattr(block, "every_step", False) for block in innermost_blocks(getattr(loop, name))):
             yield name
 
 

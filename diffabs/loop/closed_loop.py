@@ -18,6 +18,7 @@ import jax.numpy as jnp
 
 from diffabs.core.blocks import Direct, NoFeedforward, next_tick, offers, record_signal
 from diffabs.core.cubic import HermiteStep
+from diffabs.core.messages import tracked_outputs
 from diffabs.core.protocols import (
     Block,
     Clock,
@@ -165,9 +166,9 @@ class Loop(LoopParts):
         """Return the state that has this `LoopState.flow` and these `LoopState.memories`."""
         return LoopState(flow[0], *(Memory(*pair) for pair in zip(flow[1:], held, strict=True)))
 
-    def error_controlled_signals(self, state: LoopState) -> Scalar:
-        """Return the plant's first output."""
-        return self.plant.output(state.plant)[0]
+    def error_controlled_signals(self, state: LoopState) -> PyTree:
+        """Return the plant's outputs that have a target."""
+        return tracked_outputs(self.plant.output(state.plant))
 
     @property
     def changes(self) -> bool:

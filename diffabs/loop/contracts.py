@@ -19,6 +19,7 @@ import numpy as np
 
 from diffabs.core import kinds
 from diffabs.core.blocks import offers
+from diffabs.core.channels import has_channels
 from diffabs.core.protocols import Clock, Ending, Memory, Objective, Sample, Tracking, resting_segment
 from diffabs.core.pytree import canonical_dtypes, stack_lists
 from diffabs.host.values import kebab_case
@@ -64,7 +65,7 @@ def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[st
     def trace(loop: Loop, objectives: Mapping[str, Objective]) -> None:
         try:
             sample, ending = _follow_loop(loop)
-        except Misfit as error:
+        except (Misfit, ValueError) as error:  # a ValueError is the message of a packaged part
             lines.append(str(error))
             return
         for path, objective in objectives.items():
@@ -90,14 +91,23 @@ def _follow_loop(loop: Loop) -> tuple[Sample, Ending]:
     output = _call("plant", plant, "output", state)
     _check_shown(plant, output)
     measured = _follow_block("sensor", loop.sensor, output)
-    target = _follow_block("reference", loop.reference, measured, is_real=True)
+    target = _follow_block("reference", loop.reference, measured)
+    _expect_target("reference.output", target, output)
     setpoint = _call("reference", loop.reference, "setpoint", loop.reference.start(measured))
-    _expect_real("reference.setpoint", setpoint)
+    _expect_like("reference.setpoint", setpoint, target, "the target")
     feedforward = _call("feedforward", loop.feedforward, "input", plant, measured, setpoint)
-    _expect_real("feedforward.input", feedforward)
+    _expect_control("feedforward.input", feedforward, plant)
     tracking = Tracking(target, measured, feedforward)
-    command = _follow_block("controller", loop.controller, tracking, is_real=True)
-    control = _follow_block("actuator", loop.actuator, command, is_real=True)
+    try:
+        command = _follow_block("controller", loop.controller, tracking)
+    except Misfit as error:
+        if not has_channels(tracking.feedforward):
+            raise
+        controls = ", ".join(tracking.feedforward._fields)
+        raise Misfit(f"{error}; per-channel has a controller for each of the plant's controls {controls}") from error
+    _expect_control("controller.output", command, plant)
+    control = _follow_block("actuator", loop.actuator, command)
+    _expect_control("actuator.output", control, plant)
     _expect_like("plant.derivative", _call("plant", plant, "derivative", t, state, control), state, "the state")
     _expect_real("stop.margin", _call("stop", loop.stop, "margin", output))
     sample = Sample(t, output, target, setpoint, feedforward, command, control)
@@ -108,8 +118,8 @@ def _follow_loop(loop: Loop) -> tuple[Sample, Ending]:
     return sample, Ending(sample, stopped, *remainder)
 
 
-def _follow_block(name: str, block: object, signal: object, *, is_real: bool = False) -> Any:
-    """Call each method of a block once, and return its output, which has to be one real number if `is_real`."""
+def _follow_block(name: str, block: object, signal: object) -> Any:
+    """Call each method of a block once, and return its output."""
     t = jnp.asarray(0.0)
     memory = _call(name, block, "start", signal)
     _expect_memory(f"{name}.start", memory)
@@ -125,10 +135,7 @@ def _follow_block(name: str, block: object, signal: object, *, is_real: bool = F
             _expect_real(f"{name}.margins", margin)
         fired = tuple(jnp.asarray(False) for _ in margins)
         _expect_like(f"{name}.event", _call(name, block, "event", t, memory, signal, fired), memory, "memory")
-    output = _call(name, block, "output", t, memory, signal)
-    if is_real:
-        _expect_real(f"{name}.output", output)
-    return output
+    return _call(name, block, "output", t, memory, signal)
 
 
 def _follow_objective(path: str, objective: Objective, sample: Sample, ending: Ending) -> None:
@@ -190,20 +197,55 @@ def _place(error: Exception) -> str:
 
 
 def _check_shown(plant: object, output: object) -> None:
-    """Check a plant's output, its declared type `shows`, the units of `shows`, and `control_unit`."""
+    """Check a plant's output, its declared types `shows` and `controls` with their units, and `control_unit`."""
     _expect_reals("plant.output", output)
-    unit, shows = getattr(plant, "control_unit", ""), getattr(plant, "shows", None)
-    if not isinstance(unit, str):
+    unit, shows, controls = (getattr(plant, name, None) for name in ("control_unit", "shows", "controls"))
+    if unit is not None and not isinstance(unit, str):
         raise Misfit(f"plant.control_unit = {kinds.format_value(unit)} is no text, such as 'N m'")
+    if controls is not None:
+        _check_named("controls", controls)
     if shows is None:
         return  # a run does not need it; figures and tables do
-    if not (isinstance(shows, type) and hasattr(shows, "_fields")):
-        raise Misfit(f"plant.shows = {kinds.format_value(shows)} is no class of NamedTuple")
-    units = getattr(shows, "units", {})
-    if missing := [name for name in shows._fields if not isinstance(units, Mapping) or name not in units]:
-        raise Misfit(f"plant.shows: {shows.__name__}.units lacks a unit of {', '.join(missing)}")
+    _check_named("shows", shows)
+    if unknown := [name for name in getattr(shows, "tracked", ()) if name not in shows._fields]:
+        raise Misfit(f"plant.shows: {shows.__name__}.tracked has {', '.join(unknown)}, which is no output")
     if not isinstance(output, shows):
         raise Misfit(f"plant.output returns {_describe(output)}; {shows.__name__}(...) is needed, as plant.shows says")
+
+
+def _check_named(attribute: str, signals: Any) -> None:
+    """Check a plant's declared type of outputs or controls, and its units."""
+    if not (isinstance(signals, type) and hasattr(signals, "_fields")):
+        raise Misfit(f"plant.{attribute} = {kinds.format_value(signals)} is no class of NamedTuple")
+    units, names = getattr(signals, "units", {}), getattr(signals, "_fields", ())
+    if missing := [name for name in names if not isinstance(units, Mapping) or name not in units]:
+        raise Misfit(f"plant.{attribute}: {signals.__name__}.units lacks a unit of {', '.join(missing)}")
+
+
+def _expect_control(path: str, value: object, plant: object) -> None:
+    """Check a feed-forward, a command or a control: one number, or a number for each of the plant's `controls`."""
+    controls = getattr(plant, "controls", None)
+    if controls is None:
+        _expect_real(path, value)
+    elif not isinstance(value, controls):
+        raise Misfit(f"{path} returns {_describe(value)}; {controls.__name__}(...) is needed, as plant.controls says")
+    _expect_each_real(path, value)
+
+
+def _expect_target(path: str, target: object, output: object) -> None:
+    """Check a target: one number, or a number for each output in `tracked` of the plant's output type."""
+    tracked = getattr(type(output), "tracked", None)
+    if tracked is None:
+        _expect_real(path, target)
+    elif {*getattr(target, "_fields", ())} != {*tracked}:
+        raise Misfit(f"{path} returns {_describe(target)}; a NamedTuple of {', '.join(tracked)} is needed")
+    _expect_each_real(path, target)
+
+
+def _expect_each_real(path: str, signal: object) -> None:
+    for number in jax.tree.leaves(signal):
+        if _describe(number) != "float":
+            raise Misfit(f"{path} returns {_describe(signal)}; real numbers without axes are needed")
 
 
 def _expect_memory(path: str, memory: object) -> None:

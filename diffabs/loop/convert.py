@@ -8,10 +8,12 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from diffabs.core.channels import has_channels
 from diffabs.core.optional import import_optional
 from diffabs.core.protocols import Plant, Sample
 from diffabs.core.summary import Summary, round_for_table
 from diffabs.core.types import Params, PyTree
+from diffabs.core.units import control_units
 from diffabs.loop.closed_loop import LOOP_SIGNALS
 from diffabs.loop.faults import describe_faults
 
@@ -74,15 +76,20 @@ def signal_columns(sample: Sample, plant: Plant | None = None) -> dict[str, tupl
 
     The names are `t`, the plant's outputs, `target`, `setpoint`, `feedforward`, `command` and `control`
     (`Loop.problems` keeps them apart). The plant defines the unit of the last three. Without a plant the unit is
-    "control".
+    "control". In a loop with several inputs each channel has a name: `target_level_1`, `control_pump_1`.
     """
     units = type(sample.output).units
-    reference = units[sample.output._fields[0]]
-    control = plant.control_unit if plant is not None else DEFAULT_CONTROL_UNIT
     outputs = {name: (units[name], values) for name, values in sample.output._asdict().items()}
-    others = {
-        name: (reference if name in ("target", "setpoint") else control, getattr(sample, name)) for name in LOOP_SIGNALS
-    }
+    controls = control_units(plant) if plant is not None else {}
+    others = {}
+    for name in LOOP_SIGNALS:
+        signal = getattr(sample, name)
+        names = units if name in ("target", "setpoint") else controls
+        if has_channels(signal):
+            channels = signal._asdict().items()
+            others |= {f"{name}_{key}": (names.get(key, DEFAULT_CONTROL_UNIT), values) for key, values in channels}
+        else:
+            others[name] = next(iter(names.values()), DEFAULT_CONTROL_UNIT), signal
     return {"t": ("s", sample.t), **outputs, **others}
 
 
@@ -139,7 +146,7 @@ def to_figure(run: "Run", plant: Plant | None = None, title: str = "") -> Any:
     """Return a matplotlib figure of the run. The signals of the plant's output select the kind of figure."""
     from diffabs.output.plot import draw_run  # upwards: the one such import, for the method of `Run`
 
-    return draw_run(run, title=title, unit=plant.control_unit if plant is not None else "")
+    return draw_run(run, title=title, unit=getattr(plant, "control_unit", ""))
 
 
 def _attributes(run: "Run") -> Params:

@@ -20,6 +20,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.channels import outputs_like
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once
 from diffabs.core.protocols import Memory, Reference
 from diffabs.core.pytree import canonical_dtypes, part, pytree, replace
@@ -261,11 +262,11 @@ class _AtTarget:
     def flow(self, t: Scalar, memory: Memory, signal: object) -> PyTree:
         return self.reference.flow(t, memory, signal)
 
-    def output(self, t: Scalar, memory: Memory, signal: PyTree) -> Scalar:
-        del t, memory
-        return jax.lax.stop_gradient(signal[0])
+    def output(self, t: Scalar, memory: Memory, signal: PyTree) -> PyTree:
+        del t
+        return jax.lax.stop_gradient(outputs_like(signal, self.reference.setpoint(memory)))
 
-    def setpoint(self, memory: Memory) -> Scalar:
+    def setpoint(self, memory: Memory) -> PyTree:
         return self.reference.setpoint(memory)
 
 

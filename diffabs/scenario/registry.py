@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from diffabs.core import blocks, protocols
+from diffabs.core.channels import Channels
 from diffabs.core.meanings import field_meanings
-from diffabs.core.pytree import ParameterSpec
+from diffabs.core.pytree import ParameterSpec, children
 from diffabs.core.types import JsonObject, Part, PyTree, Scalar, Table
 from diffabs.core.units import Units, resolve_unit, units_inside, units_of
 from diffabs.host.values import (
@@ -180,7 +181,14 @@ def describe_missing_inner_parts(family: str, section: object, path: str) -> lis
             continue
         inner = section.get(field.name) if isinstance(section, dict) else None
         where, inner_family = f"{path}.{field.name}", family_of(field.name, family)
-        if isinstance(getattr(part, field.name), tuple):
+        if field.metadata.get("named") and inner is None:
+            names = {"type", *vars(part)}
+            items = (
+                {key: item for key, item in section.items() if key not in names} if isinstance(section, dict) else {}
+            )
+            for key, item in items.items():
+                lines += describe_missing_inner_parts(inner_family, item, f"{path}.{key}")
+        elif isinstance(getattr(part, field.name), tuple):
             items = inner.items() if isinstance(inner, dict) else enumerate(inner if isinstance(inner, list) else ())
             for key, item in items:
                 lines += describe_missing_inner_parts(inner_family, item, f"{where}.{key}")
@@ -234,8 +242,12 @@ def fill_part(template: Any, table: JsonObject, family: str, path: str, units: U
     # Every field in m/s may also be given as <field>_kmh.
     edge = {f"{n}_kmh": f for n, f in fields.items() if "spec" in f.metadata and f.metadata["spec"].unit == "m/s"}
     values = {}
+    by_name = {key: value for key, value in table.items() if key not in fields and key not in edge}
+    by_name = by_name if any(field.metadata.get("named") for field in fields.values()) else {}
     for key, value in table.items():
         where = join_path(path, key)
+        if key in by_name:
+            continue
         if key not in fields and key not in edge:
             whose = f"a field of {name_of(family, template)}" if path else "a section"
             if path and (inner := _find_inner_field(template, key)):
@@ -248,7 +260,20 @@ def fill_part(template: Any, table: JsonObject, family: str, path: str, units: U
             values[field.name] = read_number_in_range(value, in_kmh(field.metadata["spec"]), where) / KMH
         else:
             values[field.name] = _value(value, field, template, (family, where), units)
-    return dataclasses.replace(template, **values) if values else template
+    part = dataclasses.replace(template, **values) if values else template
+    # The parts by name come last, because the units in them may depend on other fields.
+    return _with_named_parts(part, by_name, family, path, units) if by_name else part
+
+
+def _with_named_parts(part: Any, table: JsonObject, family: str, path: str, units: Units | None) -> PyTree:
+    """Return a part with those of a table in its field of parts by name."""
+    field = next(field for field in dataclasses.fields(part) if field.metadata.get("named"))
+    old, inner = getattr(part, field.name), family_of(field.name, family)
+    parts = dict(old) if isinstance(old, dict) else {}
+    for name, section in table.items():
+        units_there = units_inside(part, name, units)
+        parts[name] = build_part(inner, section, parts.get(name), join_path(path, name), units_there)
+    return dataclasses.replace(part, **{field.name: parts})
 
 
 def _find_inner_field(part: Part, key: str) -> str:
@@ -307,7 +332,8 @@ def _value(
             return read_whole(value, *low_high, path)
         if type(default) not in READER_BY_TYPE:
             raise wrong_kind_error(path, value, f"a value like {format_given(default)}")
-        return READER_BY_TYPE[type(default)](value, path)
+        static = READER_BY_TYPE[type(default)](value, path)
+        return Channels({**default, **static}) if isinstance(default, Channels) else static
     return _numbers(value, np.ndim(default), field.metadata["spec"].around(units), path)
 
 
@@ -366,8 +392,9 @@ def describe_part(family: str, part: Part) -> dict[str, JsonObject]:
         row = {"default": value, "unit": "", "range": "", "low": None, "high": None}
         if "part" in field.metadata:
             inner = family_of(field.name, family)
+            items = tuple(value.values()) if isinstance(value, dict) else value
             names = (
-                [name_of(inner, item) for item in value] if isinstance(value, tuple | list) else name_of(inner, value)
+                [name_of(inner, item) for item in items] if isinstance(items, tuple | list) else name_of(inner, items)
             )
             row |= {"default": names, "range": f"any {inner}"}
         elif spec is not None:
@@ -397,6 +424,6 @@ def part_choices(part: Part, path: str = "") -> Iterator[tuple[str, JsonObject]]
     if path:
         fixed = {field.name: getattr(part, field.name) for field in fields if "static" in field.metadata}
         yield path, {"type": kebab_case(type(part).__name__), **fixed}
-    for field in fields:
-        if "part" in field.metadata:
-            yield from part_choices(getattr(part, field.name), f"{path}.{field.name}" if path else field.name)
+    for name, field, value in children(part, f"{path}." if path else ""):
+        if field is None or "part" in field.metadata:
+            yield from part_choices(value, name)

@@ -6,8 +6,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
+import numpy as np
 
 from diffabs.core.types import JsonObject, Key
+from diffabs.core.units import control_units
 from diffabs.engine.solvers import Adaptive, Solver, describe_solver
 from diffabs.host.values import ScenarioError
 from diffabs.loop.checking import check_run_accuracy, describe_loose_metrics
@@ -58,8 +60,10 @@ class Simulation(NamedTuple):
             elif math.isnan(run.metrics[name]):
                 yield f"{name} is not a number: the run lacks what it measures, as an overshoot needs a step"
         if self.at_limit > WARNED_LIMIT_SHARE:
-            limits, unit = at_limits(scenario.loop), scenario.loop.plant.control_unit
-            ends = f"{float(limits.low):g} to {float(limits.high):g} {unit}"
+            limits, units = at_limits(scenario.loop), control_units(scenario.loop.plant)
+            each = zip(units.items(), np.ravel(limits.low), np.ravel(limits.high), strict=True)
+            named = [(f"{name} " if len(units) > 1 else "", unit, low, high) for (name, unit), low, high in each]
+            ends = ", ".join(f"{name}{low:g} to {high:g} {unit}" for name, unit, low, high in named)
             share = f"{100 * self.at_limit:.0f} % of the run"
             yield f"the control is at a limit ({ends}) for {share}: gains hardly matter there"
 

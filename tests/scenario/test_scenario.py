@@ -212,8 +212,9 @@ def test_members_are_told_by_shape():
         "arm-balance",
         "acrobot",
         "printed-arm",
+        "quadruple-tank",
     }
-    assert set(registry.family_types("initial")) == {"brake-start", "balance-start"}
+    assert set(registry.family_types("initial")) == {"brake-start", "balance-start", "tank-start"}
     assert {"burckhardt", "snow", "rig-unrounded", "spline-b"} <= set(registry.family_types("road"))
     assert not {"peak", "piecewise-cubic"} & set(registry.family_types("road"))
     assert "pid" in registry.family_types("controller")

@@ -79,6 +79,8 @@ BALANCES: dict[str, Any] = {
 
 _PID = controllers.PID(kp=150.0, ki=800.0, kd=1.5, low=-5.0, high=90.0)
 
+TANK = {"pump_1": "level_1", "pump_2": "level_2"}
+
 CONTROLLERS: dict[str, Any] = {
     "pid": _PID,
     "pid, default": controllers.PID(low=0.0, high=90.0),
@@ -213,6 +215,52 @@ PARTS: dict[str, dict[str, Any]] = {
     },
 }
 
+# Parts of loops with several inputs, whose signals are no single numbers: tests/engine/test_channels.py runs them.
+WITH_CHANNELS: dict[str, dict[str, Any]] = {
+    "plant": {"quadruple tank": plants.QuadrupleTank(share_1=0.43, share_2=0.34)},
+    "initial": {"filled": plants.TankStart(level_1=0.1)},
+    "controller": {
+        "per channel": controllers.PerChannel({"pump_1": _PID, "pump_2": controllers.Relay()}, TANK),
+        "per channel, one": controllers.PerChannel(_PID, TANK),
+        "select low": controllers.SelectLow(controller=controllers.PerChannel(_PID, TANK), groups=(tuple(TANK),)),
+        "matrix feedback": controllers.MatrixFeedback(
+            gain=-np.arange(1.0, 13.0).reshape(2, 6),
+            outputs_at_rest=np.full(4, 0.1),
+            windup=-np.eye(2),
+            low=np.zeros(2),
+            high=np.full(2, 10.0),
+            states=("level_1", "level_2", "level_3", "level_4"),
+        ),
+        "observed feedback": controllers.ObservedFeedback(
+            gain=-np.arange(1.0, 9.0).reshape(2, 4),
+            state_matrix=-np.eye(2),
+            input_matrix=np.eye(2),
+            output_matrix=np.eye(2),
+            observer_gain=np.array([[0.5, 0.1], [0.0, 0.4]]),
+            outputs_at_rest=np.full(2, 0.1),
+            windup=-np.eye(2),
+            low=np.zeros(2),
+            high=np.full(2, 10.0),
+            outputs=tuple(TANK.values()),
+        ),
+    },
+    "reference": {
+        "per target": references.PerTarget(
+            reference={"level_1": references.Setpoint(value=0.13), "level_2": references.Setpoint(value=0.12)}
+        )
+    },
+    "actuator": {"per control": actuators.PerControl(actuator={"pump_1": actuators.Lag(), "pump_2": blocks.Direct()})},
+    "sensor": {
+        "per output": sensors.PerOutput(
+            sensor={"level_1": actuators.Lag(time_constant=2.0), "level_2": sensors.OutputNoise(deviation=1e-3)}
+        )
+    },
+    "objective": {
+        "in a channel": objectives.InChannel(objective=objectives.IAE(), output="level_2", control="pump_2"),
+        "over channels": objectives.OverChannels(channels=tuple(TANK.items()), weights=np.array([1.0, 2.0])),
+    },
+}
+
 BLOCKS = {(family, name): PARTS[family][name] for family in ("controller", "reference", "actuator", "sensor")
           for name in PARTS[family]}  # fmt: skip
 
@@ -223,6 +271,7 @@ def inside(part: Any) -> Iterator[Any]:
     for field in dataclasses.fields(part):
         if "part" in field.metadata:
             inner = getattr(part, field.name)
+            inner = tuple(inner.values()) if isinstance(inner, dict) else inner
             for item in inner if isinstance(inner, tuple) else (inner,):
                 yield from inside(item)
 

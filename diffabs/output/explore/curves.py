@@ -6,8 +6,10 @@ import math
 import jax
 import numpy as np
 
+from diffabs.core.channels import has_channels
 from diffabs.core.pytree import get, parameters
-from diffabs.core.types import Part
+from diffabs.core.types import Part, PyTree
+from diffabs.core.units import control_units
 from diffabs.engine.solvers import Adaptive, FixedStep, Solver
 from diffabs.linear.robustness import low_discrepancy_points
 from diffabs.loop.admissible import batch_admissibility
@@ -158,7 +160,8 @@ def _quantiles(values: np.ndarray) -> np.ndarray:
 def _layout(run: Run, plant: Part) -> list[Panel]:
     """Return the panels of one run or a batch, in full length.
 
-    They are the first signals with target and setpoint, the signals of the next unit, and the control with its command.
+    They are the first signals with target and setpoint, the signals of the next unit, and each control with its
+    command.
     """
     assert run.trajectory is not None
     sample = run.trajectory.sample
@@ -167,12 +170,25 @@ def _layout(run: Run, plant: Part) -> list[Panel]:
         words = name.replace("_", " ")
         groups.setdefault(unit, []).append(Curve(words, np.asarray(getattr(sample.output, name), float)))
     units = list(groups)
-    aims = [Curve("target", np.asarray(sample.target, float)), Curve("setpoint", np.asarray(sample.setpoint, float))]
+    aims = [curve for name in ("target", "setpoint") for curve in _channel_curves(name, getattr(sample, name))]
     shown = [Panel(units[0], (*groups[units[0]], *aims))]
     shown += [Panel(unit, tuple(groups[unit])) for unit in units[1:2]]
     shown = [_in_kmh(panel) for panel in shown] if is_vehicle(plant) else shown
-    control = [Curve(name, np.asarray(getattr(sample, name), float)) for name in ("control", "command")]
-    return [*shown, Panel(plant.control_unit, tuple(control))]
+    if not has_channels(sample.control):
+        control = [Curve(name, np.asarray(getattr(sample, name), float)) for name in ("control", "command")]
+        return [*shown, Panel(plant.control_unit, tuple(control))]
+    for channel, unit in control_units(plant).items():
+        signals = {channel: sample.control, f"{channel} command": sample.command}
+        lines = [Curve(words.replace("_", " "), np.asarray(getattr(x, channel), float)) for words, x in signals.items()]
+        shown.append(Panel(unit, tuple(lines)))
+    return shown
+
+
+def _channel_curves(name: str, signal: PyTree) -> list[Curve]:
+    """Return the curve of a target, or the curve of each channel."""
+    if not has_channels(signal):
+        return [Curve(name, np.asarray(signal, float))]
+    return [Curve(f"{name} {key.replace('_', ' ')}", np.asarray(x, float)) for key, x in signal._asdict().items()]
 
 
 def _in_kmh(panel: Panel) -> Panel:

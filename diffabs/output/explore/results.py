@@ -67,7 +67,7 @@ class ResultsPanel:
             name: unit_of(objective, scenario.loop.plant) for name, objective in scenario.objectives.items()
         }
         self.verdict_box.classes(replace="verdict stale")
-        control = charts.QUANTITIES.get(scenario.loop.plant.control_unit, "control")
+        control = charts.QUANTITIES.get(getattr(scenario.loop.plant, "control_unit", ""), "control")
         for line in (self.proved_of, self.poles_of):
             line.set_text(f"of the linear model: {control} limits are not in this")
         for line in (self.word, self.why, self.none, self.loop):

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
+from diffabs.core.channels import select_channel
 from diffabs.core.protocols import Road
 from diffabs.core.types import Table
 from diffabs.loop.result import Run, Trajectory
@@ -81,9 +82,9 @@ def draw_balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
 
 
 def draw_signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
-    """Return an overview of a run of any plant: one panel for each unit of its signals, and one for the control.
+    """Return an overview of a run of any plant: one panel for each unit of its signals, and one for each control.
 
-    The first panel also shows target and setpoint.
+    The panel of a signal with a target also shows target and setpoint. With several targets each has its own panel.
 
     Args:
         run: Run with a trajectory, as `rollout` returns it.
@@ -95,21 +96,24 @@ def draw_signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
     """
     trajectory, title = _trajectory(run, title)
     t, sample = np.asarray(trajectory.sample.t), trajectory.sample
-    groups: dict[str, list[str]] = {}
+    groups: dict[tuple[str, str], list[str]] = {}
     for name, of_signal in sample.output.units.items():
-        groups.setdefault(of_signal, []).append(name)
-    figure, axes = sheet(-(-(len(groups) + 1) // 2), 2, title=title, size=(5.6, 3.0), sharex=True)
-    for ax, (of_signal, names) in zip(axes, groups.items(), strict=False):
+        groups.setdefault((of_signal, name if name in getattr(sample.target, "_fields", ()) else ""), []).append(name)
+    controls = getattr(sample.control, "_fields", ("",))
+    count = len(groups) + len(controls)
+    figure, axes = sheet(-(-count // 2), 2, title=title, size=(5.6, 3.0), sharex=True)
+    tracked = getattr(sample.target, "_fields", sample.output._fields[:1])
+    for ax, ((of_signal, _), names) in zip(axes, groups.items(), strict=False):
         for i, name in enumerate(names):
             ax.plot(t, getattr(sample.output, name), label=spaced_name(name), **curve_style(i))
-        if ax is axes[0]:
-            ax.plot(t, sample.target, "--", color=GREY, label="target")
-            ax.plot(t, sample.setpoint, ":", color="black", label="setpoint")
+        if followed := next((name for name in tracked if name in names), ""):
+            ax.plot(t, select_channel(sample.target, followed), "--", color=GREY, label="target")
+            ax.plot(t, select_channel(sample.setpoint, followed), ":", color="black", label="setpoint")
         alone = len(names) == 1
         words = f"{spaced_name(names[0])} " if alone else ""
-        label_axes(ax, "", f"{words}[{of_signal}]", legend=ax is axes[0] or not alone)
-    count = len(groups) + 1
-    _control(axes[count - 1], trajectory, unit)
+        label_axes(ax, "", f"{words}[{of_signal}]", legend=bool(followed) or not alone)
+    for ax, name in zip(axes[len(groups) :], controls, strict=False):
+        _control(ax, trajectory, unit, name)
     for ax in axes[count:]:
         ax.set_visible(False)
     # With a shared time axis only the last row has labels; above a hidden panel they must be shown again.
@@ -119,12 +123,13 @@ def draw_signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
     return figure
 
 
-def _control(ax: Axes, trajectory: Trajectory, unit: str) -> None:
-    """Draw the controller's command and the control that the actuator delivers."""
+def _control(ax: Axes, trajectory: Trajectory, unit: str, channel: str = "") -> None:
+    """Draw the controller's command and the control that the actuator delivers, of one channel if there are several."""
     t, sample = np.asarray(trajectory.sample.t), trajectory.sample
-    ax.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
-    ax.plot(t, sample.control, color=COLOURS[0], label="control")
-    label_axes(ax, "time [s]", control_label(unit))
+    ax.plot(t, select_channel(sample.command, channel), "--", color=COLOURS[1], linewidth=1, label="command")
+    ax.plot(t, select_channel(sample.control, channel), color=COLOURS[0], label="control")
+    text = f"{spaced_name(channel)} [{sample.control.units[channel]}]" if channel else control_label(unit)
+    label_axes(ax, "time [s]", text)
 
 
 FIGURE_BY_SIGNALS = {  # figures of one run by the signals that they draw

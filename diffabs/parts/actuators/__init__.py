@@ -7,4 +7,5 @@ from diffabs.parts.actuators.lag import Lag as Lag
 from diffabs.parts.actuators.lag import Limits as Limits
 from diffabs.parts.actuators.lag import RateLimit as RateLimit
 from diffabs.parts.actuators.motor import VoltageLimit as VoltageLimit
+from diffabs.parts.actuators.per_control import PerControl as PerControl
 from diffabs.parts.actuators.valve import IntegratingValve as IntegratingValve

@@ -12,6 +12,10 @@ from diffabs.parts.controllers.feedforward import ConstantInput as ConstantInput
 from diffabs.parts.controllers.feedforward import HoldingInput as HoldingInput
 from diffabs.parts.controllers.gain_schedule import ProportionalFeedback as ProportionalFeedback
 from diffabs.parts.controllers.gain_schedule import ScheduledFeedback as ScheduledFeedback
+from diffabs.parts.controllers.matrix_feedback import MatrixFeedback as MatrixFeedback
+from diffabs.parts.controllers.matrix_feedback import ObservedFeedback as ObservedFeedback
+from diffabs.parts.controllers.per_channel import PerChannel as PerChannel
+from diffabs.parts.controllers.per_channel import SelectLow as SelectLow
 from diffabs.parts.controllers.pid import PID as PID
 from diffabs.parts.controllers.playback import PlayedCommand as PlayedCommand
 from diffabs.parts.controllers.sampled import Sampled as Sampled

@@ -10,11 +10,10 @@ the inner target: with limits that the inner loop can follow, the outer integral
 Source: Astrom and Hagglund, PID Controllers, 2nd ed., sec. 7.2 (cascade control).
 """
 
-from collections import namedtuple
 from collections.abc import Iterator
-from functools import cache
 
 from diffabs.core.blocks import offers
+from diffabs.core.channels import put_first
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import part, pytree, static
 from diffabs.core.types import Part, PyTree, Scalar
@@ -89,17 +88,10 @@ class Cascade:
         name = _inner_name(self.inner_signal, names)
         if name not in names:
             raise ValueError(f"controller.inner_signal = {name} is no output of the plant; there is {', '.join(names)}")
-        order = (name, *(field for field in names if field != name))
-        measured = _reorder_fields(order)(*(getattr(signal.measured, field) for field in order))
+        measured = put_first(signal.measured, name)
         return Tracking(self.outer.output(t, outer, self._outer_signal(signal)), measured, signal.feedforward)
 
 
 def _inner_name(name: str, names: tuple[str, ...]) -> str:
     """Return the name of the inner signal: the given one, or the second of the plant's outputs."""
     return name or names[min(1, len(names) - 1)]
-
-
-@cache
-def _reorder_fields(names: tuple[str, ...]) -> type:
-    """Return the named tuple with these fields; one class for each order, as JAX compares the classes of trees."""
-    return namedtuple("InnerOutput", names)

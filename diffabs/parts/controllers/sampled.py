@@ -21,12 +21,13 @@ from diffabs.core.arrays import as_rule_array
 from diffabs.core.blocks import offers
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
-from diffabs.core.pytree import param, part, pytree
+from diffabs.core.pytree import children, param, part, pytree, replace
 from diffabs.core.rules import Rule, period_on_grid, whole_steps
 from diffabs.core.tracing import leaf_dependence
 from diffabs.core.types import Bool, Part, PyTree, Scalar
 from diffabs.parts.controllers.antiwindup import BackCalculation, Clamping
-from diffabs.parts.controllers.cascade import CASCADED, Cascade
+from diffabs.parts.controllers.cascade import Cascade
+from diffabs.parts.controllers.per_channel import PerChannel
 from diffabs.parts.controllers.pid import PID
 from diffabs.parts.controllers.torque_logic import BandLogic
 
@@ -48,8 +49,8 @@ class SampledMemory(NamedTuple):
     """
 
     inner: Memory
-    applied: Scalar
-    next: Scalar
+    applied: PyTree
+    next: PyTree
     until: Scalar
     waits: Scalar
 
@@ -74,8 +75,9 @@ class Sampled:
     def start(self, signal: Tracking) -> Memory:
         """Return the memory with output 0, which applies until the first sample's output replaces it."""
         signal = replace_nan(signal)
-        zero = 0.0 * signal.target
-        return Memory(held=SampledMemory(self.controller.start(signal), zero, zero, zero, zero))
+        command = jax.tree.map(lambda x: 0.0 * x, signal.feedforward)
+        zero = jax.tree.leaves(command)[0]
+        return Memory(held=SampledMemory(self.controller.start(signal), command, command, zero, zero))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Return the held output [control]."""
@@ -92,7 +94,10 @@ class Sampled:
         now, number = clock.ticks(self.period)
         inner, output, _ = self.compute_guarded(clock._replace(h=self.period, k=number), m.inner, m.next, signal)
         waits = self._waits()
-        applied = jnp.where(waits, jnp.where(m.waits > 0.5, m.next, m.applied), output)
+        applied = jax.tree.map(
+            lambda next, applied, output: jnp.where(waits, jnp.where(m.waits > 0.5, next, applied), output),
+            m.next, m.applied, output,
+        )  # fmt: skip
         new = SampledMemory(inner, applied, output, self._until(clock.t), jnp.where(waits, 1.0, 0.0))
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m))
 
@@ -172,7 +177,8 @@ class Sampled:
         """Return the memory after the waiting output has become the applied one."""
         del t, signal
         m: SampledMemory = memory.held
-        applied, waits = jnp.where(fired[0], m.next, m.applied), jnp.where(fired[0], 0.0, m.waits)
+        applied = jax.tree.map(lambda next, applied: jnp.where(fired[0], next, applied), m.next, m.applied)
+        waits = jnp.where(fired[0], 0.0, m.waits)
         return Memory(held=m._replace(applied=applied, waits=waits))
 
     def _update_memory(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
@@ -188,11 +194,15 @@ class Sampled:
         yield from sampling_rules(self.controller, self.delay, self.period)
 
 
+def _controllers_in(controller: Cascade | PerChannel) -> list[tuple[str, PyTree]]:
+    """Return name and controller of each part of a cascade, or of each channel."""
+    return [(name, inner) for name, _, inner in children(controller, "")]
+
+
 def _at_period(controller: Part, period: Scalar) -> Part:
     """Return the controller with an anti-windup that fits Euler steps of `period` [s]."""
-    if isinstance(controller, Cascade):
-        inner = {name: _at_period(getattr(controller, name), period) for name in CASCADED}
-        return dataclasses.replace(controller, **inner)
+    if isinstance(controller, Cascade | PerChannel):
+        return replace(controller, {name: _at_period(inner, period) for name, inner in _controllers_in(controller)})
     antiwindup = getattr(controller, "antiwindup", None)
     if not isinstance(antiwindup, Clamping):
         return controller
@@ -228,9 +238,9 @@ def inner_controller(controller: object) -> PyTree:
 
 def sampling_rules(controller: Part, delay: Scalar, period: Scalar, name: str = "controller") -> Iterator[Rule]:
     """Yield the rules that delay, the controller's own clock and its Euler steps fit the period."""
-    if isinstance(controller, Cascade):
-        for part in CASCADED:
-            yield from sampling_rules(getattr(controller, part), delay, period, f"{name}.{part}")
+    if isinstance(controller, Cascade | PerChannel):
+        for part, inner in _controllers_in(controller):
+            yield from sampling_rules(inner, delay, period, f"{name}.{part}")
         return
     yield Rule(
         as_rule_array(delay) <= as_rule_array(period),

@@ -18,7 +18,7 @@ from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import param, part, pytree
 from diffabs.core.rules import Rule, whole_steps
-from diffabs.core.types import Scalar
+from diffabs.core.types import PyTree, Scalar
 from diffabs.parts.controllers.pid import PID
 from diffabs.parts.controllers.sampled import PERIOD_EPS, Sampled, replace_nan, sampling_rules
 
@@ -35,10 +35,10 @@ class GridMemory(NamedTuple):
     """
 
     inner: Memory
-    next: Scalar
-    last: Scalar
+    next: PyTree
+    last: PyTree
     until: Scalar
-    applied: Scalar
+    applied: PyTree
 
 
 @pytree
@@ -64,8 +64,9 @@ class SampledOnGrid:
     def start(self, signal: Tracking) -> Memory:
         """Return the memory with output 0, which applies until the first sample's output replaces it."""
         signal = replace_nan(signal)
-        zero = 0.0 * signal.target
-        return Memory(held=GridMemory(self.controller.start(signal), zero, zero, zero, zero))
+        command = jax.tree.map(lambda x: 0.0 * x, signal.feedforward)
+        zero = jax.tree.leaves(command)[0]
+        return Memory(held=GridMemory(self.controller.start(signal), command, command, zero, command))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Return the mean output over the present step [control]."""
@@ -93,8 +94,12 @@ class SampledOnGrid:
         # `waits` is the step's share of the previous output. Only a change inside the step gives it a derivative.
         fixed = jax.lax.stop_gradient(remaining)
         waits = clamp(fixed / clock.h, 0.0, 1.0) + jnp.where(within, (remaining - fixed) / clock.h, 0.0)
-        applied = waits * m.last + (1 - waits) * m.next
-        return Memory(held=m._replace(applied=jnp.where(clock.ticks()[0], applied, m.applied)))
+        is_tick = clock.ticks()[0]
+
+        def mean(last: Scalar, latest: Scalar, applied: Scalar) -> Scalar:
+            return jnp.where(is_tick, waits * last + (1 - waits) * latest, applied)
+
+        return Memory(held=m._replace(applied=jax.tree.map(mean, m.last, m.next, m.applied)))
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rules that delay and controller fit the period."""

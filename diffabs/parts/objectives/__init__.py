@@ -20,6 +20,8 @@ from diffabs.parts.objectives.braking import StopDistance as StopDistance
 from diffabs.parts.objectives.braking import StopTime as StopTime
 from diffabs.parts.objectives.braking import TorqueRate as TorqueRate
 from diffabs.parts.objectives.braking import Variation as Variation
+from diffabs.parts.objectives.channels import InChannel as InChannel
+from diffabs.parts.objectives.channels import OverChannels as OverChannels
 from diffabs.parts.objectives.tracking import IAE as IAE
 from diffabs.parts.objectives.tracking import ITAE as ITAE
 from diffabs.parts.objectives.tracking import FinalError as FinalError

@@ -5,19 +5,24 @@ setpoint is the final value of the reference and not a filtered target on its wa
 """
 
 import math
+import operator
 from collections.abc import Callable, Iterator
+from functools import reduce
 from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.core.arrays import as_rule_array
+from diffabs.core.blocks import Parallel
+from diffabs.core.channels import has_channels
 from diffabs.core.cubic import Cubic
 from diffabs.core.numerics import larger, later_of_larger, sign, smaller
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import param, parts, pytree
 from diffabs.core.rules import Rule, order_rule
-from diffabs.core.types import Part, PyTree, Scalar, Vector
+from diffabs.core.types import Bool, Numbers, Part, PyTree, Scalar, Vector
 
 STEP_EPS = 1000.0  # a shorter step, in eps of the signal, is rounding: a first slip of 0.2 is one of two speeds
 
@@ -245,20 +250,21 @@ class SettlingTime(HeldValue):
 class ShareAtLimit(HeldValue):
     """Fraction of the run's time [1] during which the controller's command is at or beyond `low` or `high`.
 
-    A step with one end at a limit counts by half. `at_limits` returns this objective with the limits of a loop.
+    A step with one end at a limit counts by half. `at_limits` returns this objective with the limits of a loop. With
+    several controls the limits have an entry for each, and one control at a limit counts.
     """
 
     unit = "1"
     physical: ClassVar[tuple[float, float]] = (0.0, 1.0)
 
-    low: Scalar = param(default=-math.inf, unit="control", below=math.inf, infinite=True)
+    low: Numbers = param(default=-math.inf, unit="control", below=math.inf, infinite=True, free=True)
     """Lower limit of the control."""
-    high: Scalar = param(default=math.inf, unit="control", above=-math.inf, infinite=True)
+    high: Numbers = param(default=math.inf, unit="control", above=-math.inf, infinite=True, free=True)
     """Upper limit of the control."""
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the step, half the step, or 0 [s]."""
-        ends = [(x.command <= self.low) | (x.command >= self.high) for x in (segment.start, segment.end)]
+        ends = [self._is_at_limit(x.command) for x in (segment.start, segment.end)]
         return memory.held + segment.h * sum(jnp.where(end, 0.5, 0.0) for end in ends)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
@@ -268,8 +274,15 @@ class ShareAtLimit(HeldValue):
         return jnp.where(t > 0, smaller(memory.held / jnp.where(t > 0, t, 1.0), 1.0), 0.0)
 
     def rules(self) -> Iterator[Rule]:
-        """Yield the rule low <= high."""
-        yield order_rule(("low", self.low), ("high", self.high), "{control}")
+        """Yield the rule low <= high of a single control."""
+        if not np.ndim(self.low):
+            yield order_rule(("low", self.low), ("high", self.high), "{control}")
+
+    def _is_at_limit(self, command: PyTree) -> Bool:
+        if not has_channels(command):
+            return (command <= self.low) | (command >= self.high)
+        ends = zip(jax.tree.leaves(command), jnp.asarray(self.low), jnp.asarray(self.high), strict=True)
+        return reduce(operator.or_, ((u <= low) | (u >= high) for u, low, high in ends))
 
 
 def at_limits(loop: Part) -> ShareAtLimit:
@@ -278,6 +291,8 @@ def at_limits(loop: Part) -> ShareAtLimit:
     The tightest limits count, also those of controllers inside a controller. Without limits they are infinite. The two
     torques of a relay are levels and not limits. The limits bound the command. An `IntegratingValve`, whose command is
     a rate, has none.
+
+    With several controls the limits have an entry for each.
 
     Args:
         loop: Loop. A part gives its limits by a method `limits()`.
@@ -290,16 +305,30 @@ def at_limits(loop: Part) -> ShareAtLimit:
         >>> print(f"{run.metrics['at a limit']:.2f}")
         0.31
     """
+    controls = getattr(loop.plant, "controls", None)
+    if controls is None:
+        low, high = _tightest_limits(loop, "")
+        return ShareAtLimit(low=low, high=high)
+    lows, highs = zip(*(_tightest_limits(loop, channel) for channel in controls._fields), strict=True)
+    return ShareAtLimit(low=jnp.stack([*map(jnp.asarray, lows)]), high=jnp.stack([*map(jnp.asarray, highs)]))
+
+
+def _tightest_limits(loop: Part, channel: str) -> tuple[Scalar, Scalar]:
+    """Return the tightest limits of the loop's control, or of one of several."""
     low, high = -math.inf, math.inf
     pending = [loop.controller, loop.actuator]
     while pending:
-        component = pending.pop()
+        component: Part = pending.pop()
         # Controllers may contain controllers (`Sampled`), so the search descends into all parts.
-        pending.extend(parts(component))
-        if hasattr(component, "limits"):
-            below, above = component.limits()
+        side_by_side = isinstance(component, Parallel) and channel in component.by_channel()
+        pending.extend([component.by_channel()[channel]] if side_by_side else parts(component))
+        if limits := getattr(component, "limits", None):
+            below, above = limits()
+            if np.ndim(below):  # of a controller with several commands
+                place = loop.plant.controls._fields.index(channel)
+                below, above = below[place], above[place]
             low, high = larger(low, below), smaller(high, above)
-    return ShareAtLimit(low=low, high=high)
+    return low, high
 
 
 @pytree

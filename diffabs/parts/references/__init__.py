@@ -6,6 +6,7 @@ from diffabs.parts.references.limited import LimitedSlip as LimitedSlip
 from diffabs.parts.references.peak_slip import PeakLatch as PeakLatch
 from diffabs.parts.references.peak_slip import PeakLiteral as PeakLiteral
 from diffabs.parts.references.peak_slip import PeakRobust as PeakRobust
+from diffabs.parts.references.per_target import PerTarget as PerTarget
 from diffabs.parts.references.setpoint import FilteredSlip as FilteredSlip
 from diffabs.parts.references.setpoint import FixedSlip as FixedSlip
 from diffabs.parts.references.setpoint import Setpoint as Setpoint
