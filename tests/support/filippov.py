@@ -110,6 +110,7 @@ def solve_exactly(p, end):
         if modes[i] == REST:
             modes[i] = UP if equivalent(p, t, y, modes)[i] > 0 else DOWN
             continue
+        rest = [j for j in range(count) if modes[j] == REST]
         old, modes[i] = modes[i], REST
         s = equivalent(p, t, y, modes)
         if abs(s[i]) < 1:
@@ -126,4 +127,9 @@ def solve_exactly(p, end):
             j = next(j for j in range(count) if modes[j] == REST and j != i and abs(s[j]) > 1)
             modes[j] = UP if s[j] > 0 else DOWN
             slowest = min(slowest, abs(abs(s[j]) - 1))
+        # In a corner of two surfaces this choice may contradict itself.
+        s = equivalent(p, t, y, modes)
+        moves = modes * margin_rates(p, t, y, s)
+        if any(abs(s[k]) > 1 if modes[k] == REST else moves[k] < 0 for k in {i, *rest}):
+            return None
     return None

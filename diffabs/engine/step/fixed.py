@@ -22,10 +22,10 @@ from diffabs.engine.hybrid import HybridState, HybridSystem
 from diffabs.engine.step.advance import Carry, Decision, Judged, advance, cast_floats, start_carry
 from diffabs.engine.step.attempt import Attempt, Point, StepRequest
 from diffabs.engine.step.event_location import RunStatus
-from diffabs.engine.step.modes import SurfaceCrossing
+from diffabs.engine.step.modes import SlidingSurface, SurfaceCrossing
 from diffabs.engine.step.outlook import look_ahead
 from diffabs.engine.step.runge_kutta import RK4
-from diffabs.engine.step.slides import begin_slide, ended_slide
+from diffabs.engine.step.slides import along_of, begin_slide, ended_slide
 from diffabs.engine.step.switching import FREE_MODES, KEPT_MODES, UNSWITCHED, Checks, ModeGuard, Strain, Unswitched
 from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, Objectives, ObservedSystem
 
@@ -111,7 +111,7 @@ class FixedStepping:
     def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `hybrid`, `objectives` and random `key`."""
         method = self._for_values(hybrid)
-        foresee = partial(method._look_ahead, jnp.asarray(True), -1)
+        foresee = partial(method._look_ahead, jnp.asarray(True), -1, ())
         carry = start_carry(method, hybrid, objectives, key, foresee)
         return cast_floats(carry._replace(control=FixedStepControl(carry.k, carry.k)), self.h.dtype)
 
@@ -166,7 +166,8 @@ class FixedStepping:
 
     def forecast(self, carry: Carry, dynamics: Evaluation) -> PyTree:
         """Return the `Outlook` of a method that watches all margins, and else nothing."""
-        return self._look_ahead(carry.status == RunStatus.REFRESHING, ended_slide(carry), dynamics)
+        fresh = carry.status == RunStatus.REFRESHING
+        return self._look_ahead(fresh, ended_slide(carry), along_of(carry), dynamics)
 
     def report(
         self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation, state: HybridState, error: object
@@ -205,7 +206,7 @@ class FixedStepping:
             if self.switches.watches:
                 grazes = attempt.report.grazes & (decision.accepted | decision.searches)
                 status = self.switches.judge(status, guard.slides, grazes, after)
-                lost |= grazes & _outruns_step(carry, attempt)
+                lost |= grazes & (carry.status == RunStatus.RUNNING) & _outruns_step(carry, attempt)
         max_extra = (EVENT_ATTEMPTS_PER_STEP + self.crossing_attempts) * self.steps + SPARE_ATTEMPTS
         status = jnp.where(extra > max_extra, RunStatus.EXHAUSTED, status)
         strikes = status == RunStatus.RUNNING
@@ -242,8 +243,8 @@ class FixedStepping:
         """Return the numbers at the end of an attempt that must be finite."""
         return end.state.flow()
 
-    def _look_ahead(self, fresh: Bool, ended: Int, dynamics: Evaluation) -> PyTree:
-        return look_ahead(fresh, ended, dynamics) if self.has_margin_rates else ()
+    def _look_ahead(self, fresh: Bool, ended: Int, along: tuple[SlidingSurface, ...], dynamics: Evaluation) -> PyTree:
+        return look_ahead(fresh, ended, along, dynamics) if self.has_margin_rates else ()
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["h", "steps"], meta_fields=["switches", "second_order"])

@@ -16,7 +16,7 @@ from diffabs.core.types import Array, Bool, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState
 from diffabs.engine.step.advance import Carry
 from diffabs.engine.step.event_location import RunStatus
-from diffabs.engine.step.modes import mode_in_step, stack_flat
+from diffabs.engine.step.modes import SlidingSurface, mode_in_step, stack_flat
 from diffabs.engine.step.slides import along_of
 from diffabs.engine.step.system import Evaluation, ObservedSystem
 
@@ -85,10 +85,10 @@ def find_turns(starts: Outlook, ends: Outlook, length: Scalar, landing: Array) -
     return jax.lax.cond(any_lane(jnp.any(near)), find, lambda: Turns(jnp.zeros_like(length), jnp.asarray(False)))
 
 
-def look_ahead(fresh: Bool, ended: PyTree, dynamics: Evaluation) -> Outlook:
+def look_ahead(fresh: Bool, ended: PyTree, along: tuple[SlidingSurface, ...], dynamics: Evaluation) -> Outlook:
     """Return the margins at an instant; it is `fresh` if its numbers have just chosen the mode of the next step.
 
-    `ended` is the number of the comparison whose slide ends here, or -1.
+    `ended` is the number of the comparison whose slide ends here, or -1. The run slides `along` surfaces.
     """
     margins, rates, numbers = _list_margins(dynamics, 0)
     # A run leaves its surface with the rate 0, whose sign is that of a rounding error.
@@ -96,8 +96,11 @@ def look_ahead(fresh: Bool, ended: PyTree, dynamics: Evaluation) -> Outlook:
         fresh & (numbers == ended) & (jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(dynamics.margins)))
     )
     margins, rates = (jnp.where(rest, 0.0, x) for x in (margins, rates))
-    # The margin of a newly chosen answer may have any sign. It is turned so that it is positive within the mode.
+    # The margin of a newly chosen answer may have any sign. It is turned so that it is positive within the mode. That
+    # of a slide is negative where its share has jumped beyond 0 or 1, because another answer has changed.
     surfaces = jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(dynamics.margins))
+    for surface in along:
+        surfaces &= numbers != surface.number
     turned = fresh & surfaces & ((margins < 0) | ((margins == 0) & (rates < 0)))
     return Outlook(jnp.where(turned, -margins, margins), jnp.where(turned, -rates, rates))
 
@@ -106,7 +109,10 @@ def watch_margins(carry: Carry, h: Scalar, dynamics: Evaluation, bit_count: int)
     """Return where margins turn back in an attempt; nowhere in the attempts of a search, before it lands."""
     margins, rates, numbers = _list_margins(dynamics, bit_count)
     running, landing = (carry.status == status for status in (RunStatus.RUNNING, RunStatus.LANDING))
-    turns = find_turns(_outlook(carry), Outlook(margins, rates), h, landing & (numbers == carry.search.number))
+    start = _outlook(carry)
+    # A margin that is negative already is that of a share: its slide ends at once.
+    lands = landing & (numbers == carry.search.number) & (start.margins >= 0)
+    turns = find_turns(start, Outlook(margins, rates), h, lands)
     return Turns(jnp.where(running, turns.time_since, 0.0), (running | landing) & turns.grazes)
 
 

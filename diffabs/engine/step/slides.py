@@ -7,7 +7,8 @@ surface, and the times of these landings have no meaning for a derivative. So it
     slide      a landing on a surface that it has met since then is a return. The run slides along it after two returns
                at once, or after three later ones. A touched surface brings one return. Margins that are zero to
                rounding bring none: they do not fall along a line
-    end        the run leaves where its share reaches 0 or 1, a landing, too
+    end        the run leaves where its share reaches 0 or 1, a landing, too; at once if the share jumps beyond, because
+               another answer changes
     lost       a slide that ends as soon as it begins, again and again, as where a run spirals into the intersection of
                two surfaces, or one along more surfaces than `MAX_SURFACES`. Such a run has no derivative
 

@@ -34,6 +34,7 @@ from diffabs.engine.step.modes import (
     ComparisonAnswers,
     Mode,
     ModeBits,
+    SlidingSurface,
     SurfaceCrossing,
     find_contradicted,
     find_imminent,
@@ -73,6 +74,7 @@ class Horizon(NamedTuple):
         unrestricted: True if the next step has no mode.
         fresh: True if the numbers there have just chosen the mode of the next step.
         ended: Number of the comparison whose slide ends there, or -1.
+        along: Surfaces along which the next step slides.
     """
 
     natural: Scalar
@@ -80,6 +82,7 @@ class Horizon(NamedTuple):
     unrestricted: Bool
     fresh: Bool
     ended: PyTree
+    along: tuple[SlidingSurface, ...]
 
 
 class Trial(NamedTuple):
@@ -331,7 +334,7 @@ class FreeModes(Unswitched):
 
     def look_ahead(self, horizon: Horizon, dynamics: Evaluation) -> Outlook:
         """Return the margins whose turns are looked for."""
-        return look_ahead(horizon.fresh, horizon.ended, self._select_watched(dynamics))
+        return look_ahead(horizon.fresh, horizon.ended, horizon.along, self._select_watched(dynamics))
 
     def find_turns(self, system: ObservedSystem, carry: Carry, h: Scalar, dynamics: Evaluation) -> Turns:
         """Return where these margins turn back in an attempt."""
