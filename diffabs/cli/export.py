@@ -10,6 +10,7 @@ import typer
 
 from diffabs import __version__
 from diffabs.cli import console, targets
+from diffabs.core.units import control_units
 from diffabs.engine.solvers import FixedStep
 from diffabs.host.values import ScenarioError
 from diffabs.scenario.scenario import Scenario
@@ -122,4 +123,5 @@ def _write_fmu(scenario: Scenario, file: pathlib.Path, out: pathlib.Path) -> Non
         lambda: build_fmu(scenario.loop, name, **times, about=about), f"compiling the plant of {scenario.name}"
     )
     file.write_bytes(data)
-    console.say(f"fmu: {out}; FMI 2.0 for co-simulation, input control [{scenario.loop.plant.control_unit}]")
+    inputs = ", ".join(f"{name} [{unit}]" for name, unit in control_units(scenario.loop.plant).items())
+    console.say(f"fmu: {out}; FMI 2.0 for co-simulation, input {inputs}")

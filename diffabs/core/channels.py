@@ -142,3 +142,10 @@ def outputs_like(output: PyTree, target: PyTree) -> PyTree:
     if not has_channels(target):
         return output[0]
     return type(target)(*(getattr(output, name) for name in target._fields))
+
+
+def need_single_control(plant: object, purpose: str) -> None:
+    """Raise a ValueError for a plant with several inputs; `purpose` says what needs a plant with one."""
+    if controls := getattr(plant, "controls", None):
+        names = ", ".join(controls._fields)
+        raise ValueError(f"{purpose} needs a loop with one control; plant {type(plant).__name__} has {names}")

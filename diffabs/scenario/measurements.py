@@ -21,7 +21,8 @@ TIME_COLUMN = "t [s]"
 TIME_NAMES = ("t", "time", "time [s]")  # of the column, beside TIME_COLUMN, in small or capital letters
 RENAME_HINT = '--rename "COLUMN=NAME" gives a column the name of a signal, or t'
 MAX_LISTED = 20  # columns of the file that a message lists
-IGNORED = tuple(f"{name} [" for name in LOOP_SIGNALS)  # columns of a simulation without a measurement
+# Beginnings of the columns of a simulation without a measurement: of the signal, or of a channel of it.
+IGNORED = tuple(f"{name}{end}" for name in LOOP_SIGNALS for end in (" [", "_"))
 
 
 class Readings(NamedTuple):

@@ -27,6 +27,7 @@ from diffabs.core.units import Units, resolve_unit, units_inside, units_of
 from diffabs.host.values import (
     READER_BY_TYPE,
     ScenarioError,
+    as_plain,
     dotted_path,
     format_given,
     kebab_case,
@@ -422,7 +423,7 @@ def part_choices(part: Part, path: str = "") -> Iterator[tuple[str, JsonObject]]
         return
     fields = dataclasses.fields(part)
     if path:
-        fixed = {field.name: getattr(part, field.name) for field in fields if "static" in field.metadata}
+        fixed = {field.name: as_plain(getattr(part, field.name)) for field in fields if "static" in field.metadata}
         yield path, {"type": kebab_case(type(part).__name__), **fixed}
     for name, field, value in children(part, f"{path}." if path else ""):
         if field is None or "part" in field.metadata:

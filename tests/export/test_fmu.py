@@ -22,8 +22,8 @@ from diffabs.compiler.runtime.toolchain import COMPILER
 from diffabs.core.types import Vector
 from diffabs.output.export import NotExported, build_fmu, computer_program, structured_text
 from diffabs.output.export.plant_c import plant_source
-from diffabs.parts.controllers import PID, ConstantInput, ConstantTorque, Sampled
-from diffabs.parts.plants import MirroredRig
+from diffabs.parts.controllers import PID, ConstantInput, ConstantTorque, PerChannel, Sampled
+from diffabs.parts.plants import MirroredRig, QuadrupleTank
 from diffabs.parts.references import FixedSlip
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import load
@@ -86,6 +86,23 @@ def test_an_fmu_runs_as_the_simulation_does(name, tmp_path):
         wanted = getattr(kept.output, field)[: count + 1]
         np.testing.assert_allclose(column, wanted, rtol=1e-6, atol=1e-9, err_msg=field)
     assert np.ptp(found[:, 0]) > 1e-3
+
+
+@killed_by(
+    "output.export.plant_c", "for name, unit in control_units(plant).items()]", 'for name, unit in [("control", "V")]]'
+)
+def test_a_plant_with_two_inputs_has_both(tmp_path):
+    """Constant voltages, which the controllers' limits keep, give the run of the simulation."""
+    pumps = {name: PID(kp=0.0, cutoff=1.0, low=volts, high=volts) for name, volts in (("pump_1", 3.0), ("pump_2", 2.5))}
+    tank = QuadrupleTank()
+    channels = {"pump_1": "level_1", "pump_2": "level_2"}
+    loop = d.Loop(plant=tank, **{**tank.usual_parts(), "controller": PerChannel(pumps, channels)})
+    wanted = trajectory(loop, 20.0, every=1, step=0.1)
+    fmu = imported(loop, tmp_path, step=0.1).begin()
+    assert fmu.set("pump_1", 3.0) == fmu.set("pump_2", 2.5) == 0
+    for k in range(200):
+        assert fmu.step(0.1 * k, 0.1) == 0
+    np.testing.assert_allclose(fmu.get(*wanted._fields), [values[-1] for values in wanted], rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -157,14 +157,16 @@ def computer_program(
     Raises:
         ValueError: The step is not positive and finite, or the type is neither float32 nor float64.
         NotExported: A parameter is no number or has a wrong value or shape, the controller runs in continuous time,
-            or a period has more than MAX_STEPS_PER_SAMPLE steps. Without `given_target`, also a reference that follows
-            measurements, ticks or has events.
+            the plant has several inputs, or a period has more than MAX_STEPS_PER_SAMPLE steps. Without `given_target`,
+            also a reference that follows measurements, ticks or has events.
     """
     if step is not None and not 0 < step < np.inf:
         raise ValueError(f"step = {step:g} s: a positive and finite number is needed")
     if np.dtype(dtype) not in (np.float32, np.float64):
         raise ValueError(f"dtype = {np.dtype(dtype)}: float32 or float64 is needed")
     check_numbers(loop)
+    if hasattr(loop.plant, "controls"):
+        raise NotExported("a program for a computer has one command; build the FMU of a plant with several inputs")
     loop = with_sampled_controller(loop)
     controller: Part = loop.controller
     with jax.enable_x64(True):

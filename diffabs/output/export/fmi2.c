@@ -1,6 +1,6 @@
 /* FMI 2.0 for co-simulation of a plant. The text before this file defines the struct `model`, plant_start, plant_step,
-   plant_show, GUID, VARIABLES, OUTPUTS, STATES and STEP. It also defines arrays for the variables: `begun` (values
-   before anything is set) and `low` and `high` (limits). A call out of order or with a value out of range returns an
+   plant_show, GUID, VARIABLES, OUTPUTS, INPUTS, STATES and STEP. It also defines arrays for the variables: `begun`
+   (values before anything is set) and `low` and `high` (limits). A call out of order or with a value out of range returns an
    error and changes nothing. After a failed step only a reset, another state or termination is allowed. */
 #include <stdlib.h>
 #include <string.h>
@@ -126,9 +126,9 @@ EXPORT fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference at[], si
   if (m == NULL || m->phase > RUNNING || (n > 0 && (at == NULL || value == NULL)))
     return fmi2Error;
   for (size_t i = 0; i < n; i++)
-    if (at[i] >= VARIABLES || at[i] < OUTPUTS || (m->phase == RUNNING && at[i] != OUTPUTS) ||
+    if (at[i] >= VARIABLES || at[i] < OUTPUTS || (m->phase == RUNNING && at[i] >= OUTPUTS + INPUTS) ||
         !(value[i] >= low[at[i]] && value[i] <= high[at[i]]))
-      return fmi2Error; /* only the control is an input; parameters are fixed after initialization */
+      return fmi2Error; /* only the controls are inputs; parameters are fixed after initialization */
   for (size_t i = 0; i < n; i++)
     m->v[at[i]] = value[i];
   return fmi2OK;

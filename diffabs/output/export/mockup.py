@@ -38,7 +38,7 @@ CAUSES = {
 def build_fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, about: str = "") -> bytes:
     """Return an FMU of a loop's plant as the bytes of its zip archive; it runs on this kind of machine.
 
-    The control is the input, and the signals of the plant's output are the outputs. Every number of the plant and of
+    The controls are the inputs, and the signals of the plant's output are the outputs. Every number of the plant and of
     its initial condition is a parameter that the importing tool may set.
 
     Args:
@@ -80,7 +80,7 @@ def build_fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, abou
 
 def _source(plant: PlantSource, guid: str, step: float) -> str:
     """Return all C of the FMU as one file."""
-    outputs = sum(variable.role == "output" for variable in plant.variables)
+    outputs, inputs = (sum(variable.role == role for variable in plant.variables) for role in ("output", "input"))
     number = Words("double", lambda op, place: place).literal  # a literal has no place
     begun = ", ".join(number(variable.value) for variable in plant.variables)
     struct = "double v[VARIABLES], x[STATES], time, stop;\n  int phase, ready;\n  char guid[sizeof GUID];"
@@ -91,7 +91,8 @@ def _source(plant: PlantSource, guid: str, step: float) -> str:
         "#include <math.h>\n#include <stdbool.h>\n#include <stddef.h>\n#include <stdint.h>\n\n"
         # Constants, not macros: a macro would replace variables of the same name in the plant's code.
         f'static const char GUID[] = "{guid}";\nstatic const double STEP = {step!r};\n'
-        f"enum {{ VARIABLES = {len(plant.variables)}, OUTPUTS = {outputs}, STATES = {plant.states} }};\n\n"
+        f"enum {{ VARIABLES = {len(plant.variables)}, OUTPUTS = {outputs}, INPUTS = {inputs} }};\n"
+        f"enum {{ STATES = {plant.states} }};\n\n"
         f"typedef struct {{\n  {struct}\n}} model;\n\n"
         f"static const double begun[VARIABLES] = {{{begun}}};\n"
         f"static const double low[VARIABLES] = {{{limits['low']}}};\n"

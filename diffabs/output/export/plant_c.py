@@ -19,13 +19,11 @@ from diffabs.compiler.lower.rules import Unsupported
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import ParameterSpec, canonical_dtypes, parameters, prepare_parts
 from diffabs.core.types import PyTree, Scalar
-from diffabs.core.units import unit_at
+from diffabs.core.units import control_units, unit_at
 from diffabs.engine.step.runge_kutta import rk4_step
 from diffabs.loop.closed_loop import Loop
 from diffabs.output.export.device import NotExported, check_numbers
 from diffabs.output.export.lowered import fill_shapes, number_leaves, trace_outputs
-
-CONTROL = "control"
 
 
 class FmuVariable(NamedTuple):
@@ -79,10 +77,10 @@ def plant_source(loop: Loop) -> PlantSource:
 
 
 def _variables(loop: Loop) -> tuple[FmuVariable, ...]:
-    """Return the variables: outputs, control, then each number of the parameters of plant and start."""
+    """Return the variables: outputs, controls, then each number of the parameters of plant and start."""
     plant = loop.plant
     variables = [FmuVariable(name, "output", 0.0, plant.shows.units[name]) for name in plant.shows._fields]
-    variables.append(FmuVariable(CONTROL, "input", 0.0, plant.control_unit))
+    variables += [FmuVariable(name, "input", 0.0, unit) for name, unit in control_units(plant).items()]
     for where, part in (("plant", plant), ("initial", loop.initial)):
         for path, spec, value in parameters(part):
             numbers = np.asarray(value, float)
@@ -131,14 +129,16 @@ class _Written:
         self.order = {node.attr[1]: k for k, node in enumerate(node for array in held for node in array.flat)}
         self.states = len(self.order)
         scalar = jax.ShapeDtypeStruct((), np.float64)
-        control, time, length = (
+        names = control_units(plant)
+        *controls, time, length = (
             np.full((), graph.input(np.float64, UpdateLevel.UNIFORM, place), object)
-            for place in (("v", CONTROL), ("", "t"), ("", "h"))
+            for place in (*(("v", name) for name in names), ("", "t"), ("", "h"))
         )
+        control = plant.controls(*(scalar for _ in names)) if hasattr(plant, "controls") else scalar
         self.begun = trace_outputs(graph, lambda both: prepare_parts(both[0]).start(both[1]), typed, inputs)
-        moving, shown = (plant, state, scalar, scalar, scalar), (plant, state)
+        moving, shown = (plant, state, control, scalar, scalar), (plant, state)
         self.moved = trace_outputs(
-            graph, lambda all: _advance_state(*all), moving, [*plant_inputs, *held, control, time, length]
+            graph, lambda all: _advance_state(*all), moving, [*plant_inputs, *held, *controls, time, length]
         )
         self.shown = trace_outputs(
             graph, lambda both: prepare_parts(both[0]).output(both[1]), shown, [*plant_inputs, *held]
@@ -166,7 +166,7 @@ class _Written:
         yield "}\n"
 
 
-def _advance_state(plant: Plant, state: PyTree, control: Scalar, t: Scalar, h: Scalar) -> PyTree:
+def _advance_state(plant: Plant, state: PyTree, control: PyTree, t: Scalar, h: Scalar) -> PyTree:
     """Return the state after a step with constant control, as `FixedStep` computes it."""
     plant = prepare_parts(plant)
     return plant.project(rk4_step(lambda t, x: plant.derivative(t, x, control), t, state, h))

@@ -177,13 +177,14 @@ def control_label(unit: str) -> str:
 
 
 def signal_label(output: PyTree) -> str:
-    """Return the axis label of the first signal of an output.
+    """Return the axis label of the signals of an output that have a target.
 
     Args:
         output: Output of a plant, with `units`.
     """
-    name, unit = next(iter(output.units.items()))
-    return f"{spaced_name(name)} [{unit}]"
+    names = getattr(output, "tracked", tuple(output.units)[:1])
+    units = dict.fromkeys(output.units[name] for name in names)
+    return f"{', '.join(map(spaced_name, names))} [{', '.join(units)}]"
 
 
 def spaced_name(name: str) -> str:

@@ -2,12 +2,14 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
+from diffabs.core.channels import outputs_like
 from diffabs.core.types import PyTree, Scalar
+from diffabs.core.units import control_units
 from diffabs.loop.closed_loop import Loop
 from diffabs.loop.result import Trajectory
 from diffabs.loop.run import rollout
@@ -57,7 +59,7 @@ def draw_worst_run(work: "Work", tuned: "Tuned") -> Figure:
 
     runs = {"before": roll_out(scenario.loop), "after": roll_out(tuned.loop)}
     where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
-    title, unit = scenario.title or scenario.name, scenario.loop.plant.control_unit
+    title, unit = scenario.title or scenario.name, ", ".join({*control_units(scenario.loop.plant).values()})
     return draw_tuning(tuned.history, runs, title=title, lane=where, unit=unit)
 
 
@@ -129,18 +131,25 @@ def _gradient(ax: Axes, points: Sequence[PyTree]) -> None:
 
 
 def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str = "", unit: str = "N m") -> None:
-    """Draw the first signal (the slip of a brake) with its setpoint, and the control."""
+    """Draw the signals with a target (the slip of a brake) and their setpoints, and the controls."""
     for i, (name, trajectory) in enumerate(runs.items()):
-        t = np.asarray(trajectory.sample.t)
-        slip.plot(t, trajectory.sample.output[0], label=name, **curve_style(i))
-        torque.plot(t, trajectory.sample.control, label=name, linewidth=1.2, **curve_style(i))
+        t, sample = np.asarray(trajectory.sample.t), trajectory.sample
+        _draw_channels(slip, t, outputs_like(sample.output, sample.setpoint), label=name, **curve_style(i))
+        _draw_channels(torque, t, sample.control, label=name, linewidth=1.2, **curve_style(i))
     first = next(iter(runs.values())).sample
-    slip.plot(np.asarray(first.t), first.setpoint, color=GREY, linewidth=0.9, linestyle=":", label="setpoint")
+    grey = {"color": GREY, "linewidth": 0.9, "linestyle": ":"}
+    _draw_channels(slip, np.asarray(first.t), first.setpoint, label="setpoint", **grey)
     label_axes(slip, "time [s]", signal_label(first.output), title)
     label_axes(torque, "time [s]", control_label(unit), legend=False)
     for ax in (slip, torque):
         ax.set_xlim(0, _arrival_time(runs))
         ax.locator_params(axis="x", nbins=6)
+
+
+def _draw_channels(ax: Axes, t: np.ndarray, signal: PyTree, label: str, **style: Any) -> None:
+    """Draw a signal, or each of its channels in the same style."""
+    for i, values in enumerate(jax.tree.leaves(signal)):
+        ax.plot(t, values, label=label if i == 0 else "_", **style)
 
 
 def _arrival_time(runs: Mapping[str, Trajectory]) -> float:
@@ -150,8 +159,11 @@ def _arrival_time(runs: Mapping[str, Trajectory]) -> float:
     """
     ends = []
     for trajectory in runs.values():
-        t, slip = np.asarray(trajectory.sample.t), np.asarray(trajectory.sample.output[0])
-        away = np.flatnonzero(np.abs(slip - np.asarray(trajectory.sample.setpoint)) > 0.02 * np.max(np.abs(slip)))
-        ends.append(float(t[away[-1]]) if len(away) else 0.0)
+        t, sample = np.asarray(trajectory.sample.t), trajectory.sample
+        for signal, setpoint in zip(
+            *map(jax.tree.leaves, (outputs_like(sample.output, sample.setpoint), sample.setpoint)), strict=True
+        ):
+            away = np.flatnonzero(np.abs(signal - setpoint) > 0.02 * np.max(np.abs(signal)))
+            ends.append(float(t[away[-1]]) if len(away) else 0.0)
     whole = max(float(np.asarray(trajectory.sample.t)[-1]) for trajectory in runs.values())
     return min(whole, SETTLED_MULTIPLE * max(ends)) or whole

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.blocks import Direct, Series
+from diffabs.core.channels import need_single_control
 from diffabs.core.types import AnyArray, Part, PyTree
 from diffabs.core.units import insert_unit, units_of
 from diffabs.core.validity import check_part
@@ -64,6 +65,7 @@ def reduce_loop(loop: Loop) -> ReducedLoop:
     The actuator may have limits, one lag and a delay. A balance, or a plant that is no brake, is linearised at rest.
     """
     check_part(loop)
+    need_single_control(loop.plant, "a proof by state feedback")
     if isinstance(inner_controller(loop.controller), BalanceFeedback):
         return reduce_balance_loop(loop)
     if not hasattr(loop.plant, "frozen"):

@@ -1,0 +1,116 @@
+"""The commands on a loop with two inputs, and docs/plant-with-two-inputs.md."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from commands import assert_one_error_line, run
+from mutants import killed_by
+from project import ROOT
+
+from diffabs.scenario import outside
+from diffabs.scenario.scenario import dump, load, loads
+
+HERE = ROOT / "examples" / "two-inputs"
+SHORT = ("--set", "solver.duration=30")
+
+
+@killed_by("loop.convert", '{f"{name}_{key}": (', '{f"{key}_{name}": (')
+def test_a_run_has_columns_of_each_channel(tmp_path):
+    out = tmp_path / "run.csv"
+    result = run("simulate", "quadruple-tank", *SHORT, "--csv", out, "--plot", tmp_path / "run.svg", "--json")
+    assert {"iae_1", "iae_2"} < json.loads(result.stdout)["metrics"].keys()
+    header = out.read_text().partition("\n")[0].split(",")
+    assert {"control_pump_1 [V]", "target_level_2 [m]", "feedforward_pump_2 [V]"} < {*header}
+    free = ("--set", "plant.share_1=0.75", "--free", "plant.share_1=0.5:0.9")
+    identified = run("identify", "quadruple-tank", *SHORT, "--data", out, *free, "--json", "-q")
+    np.testing.assert_allclose(json.loads(identified.stdout)["values"]["plant.share_1"]["value"], 0.7, rtol=1e-6)
+
+
+def test_a_scenario_is_written_and_read_again():
+    text = dump(load("quadruple-tank", ["controller.pump_1.kp=100", "reference.level_2.value=0.14"]))
+    again = loads(text.encode(), "again", "again")
+    assert dump(again) == text
+    assert again.loop.controller.controller["pump_1"].kp == 100.0
+
+
+@killed_by("scenario.registry", "{**default, **static}", "static")
+def test_an_override_changes_one_channel():
+    loop = load("quadruple-tank", ["controller.channels.pump_1=level_2", "controller.pump_2=pid"]).loop
+    assert dict(loop.controller.channels) == {"pump_1": "level_2", "pump_2": "level_2"}
+    assert loop.controller.controller["pump_2"].kp == 3893.0
+
+
+def test_tune_and_sweep(tmp_path):
+    tuned = tmp_path / "tuned.toml"
+    fast = ("--set", "solver.duration=60", "--set", "tune.iterations=2", "--set", "sweep.samples=16")
+    result = json.loads(run("tune", HERE / "tank.toml", *fast, "--out", tuned, "--json").stdout)
+    assert result["objective"]["after"] < 0.9 * result["objective"]["before"]
+    summary = json.loads(run("sweep", tuned, "--out", tmp_path / "swept", "--json").stdout)
+    assert summary["complete"]
+    assert {"overshoot_1", "iae"} < summary["metrics"].keys()
+
+
+REFUSED = {
+    "a channel of no output": (
+        ["simulate", "quadruple-tank", "--set", "controller.channels.pump_1=level_9"],
+        "level_9",
+    ),
+    "a controller of one": (["simulate", "quadruple-tank", "--set", "controller=pid"], "per-channel"),
+    "a controller without a channel": (
+        ["simulate", "quadruple-tank", "--set", "controller.pump_3=pid"],
+        "there are controllers of pump_1, pump_2, pump_3",
+    ),
+    "a proof": (["certify", "quadruple-tank"], "needs a loop with one control; plant QuadrupleTank has pump_1, pump_2"),
+    "a program": (["export", "quadruple-tank", "--period", "0.5"], "a program for a computer has one command"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_does_not_go_is_refused_in_a_line(name):
+    words, line = REFUSED[name]
+    result = run(*words, status=2)
+    assert_one_error_line(result)
+    assert line in result.stderr
+
+
+def test_the_page_is_the_example():
+    blocks = re.findall(
+        r"```\w+\n# ([\w.]+)\n(.*?)```", (ROOT / "docs/plant-with-two-inputs.md").read_text(), re.DOTALL
+    )
+    files = {}
+    for name, text in blocks:
+        files[name] = files.get(name, "") + text
+    assert set(files) == {"two_rooms.py", "rooms.toml", "tank.toml"}
+    for name, text in files.items():
+        assert text.split() == (HERE / name).read_text().split()
+
+
+@pytest.fixture
+def rooms(monkeypatch):
+    monkeypatch.syspath_prepend(str(HERE))
+    before = dict(vars(outside).get("_modules", {}))
+    yield
+    vars(outside).get("_modules", {}).clear()
+    vars(outside).get("_modules", {}).update(before)
+
+
+def test_the_two_rooms_of_the_page(rooms):
+    """Warm rooms agree with the rest of the linear equations, and a fuse for both heaters holds."""
+    result = json.loads(run("simulate", HERE / "rooms.toml", "--parts", "two_rooms", "--json").stdout)
+    assert 0 < result["metrics"]["iae_room_1"] < 1e4
+    page = (ROOT / "docs/plant-with-two-inputs.md").read_text()
+    scope: dict = {}
+    exec(re.search(r"```python\n(import jax\n.*?)```", page, re.DOTALL)[1], scope)
+    import two_rooms
+
+    import diffabs as d
+
+    plant = two_rooms.TwoRooms()
+    usual = plant.usual_parts()
+    fuse = scope["SharedFuse"](controller=usual["controller"], high=3500.0)
+    run_of_rooms = d.rollout(d.Loop(plant=plant, **{**usual, "controller": fuse}), d.FixedStep(5.0, 7200.0), {})
+    power = np.asarray(run_of_rooms.trajectory.sample.command)
+    assert np.max(power.sum(axis=0)) <= 3500.0 * (1 + 1e-12)
+    np.testing.assert_allclose(run_of_rooms.ending.sample.output, (21.0, 18.0), atol=0.05)
