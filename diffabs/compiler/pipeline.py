@@ -10,12 +10,16 @@ When JAX differentiates this primitive:
 
     jvp        autodiff.jvp.differentiate_functions  a program with one tangent direction
 
+When JAX transposes it:
+
+    transpose  autodiff.transpose.trace_transpose    the transposed replay of a step (`LanePrograms.sweeps`)
+
 When JAX compiles it:
 
     eliminate  autodiff.jvp.replicate_tangents       all tangent directions, with few operations (`autodiff.eliminate`)
                program.keep_read                     without updates of the carry that nothing reads
     schedule   schedule.schedule_nodes               operations inside the conditionals that need them
-    emit       emit.cpp.emit_cpp, emit.cuda          text, one function for each of the functions; calls `schedule`
+    emit       emit.cpp, emit.sweeps, emit.cuda      text, one function for each of the functions; calls `schedule`
     build      runtime.cpu.build_target, runtime.gpu a library or GPU code, from the cache if possible
 
 `operations.OPERATIONS` has a row for each operation: its value for constants, and its text in each language.
@@ -29,6 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.compiler.autodiff.transpose import Sweeps
 from diffabs.compiler.emit.cpp import LaunchShape
 from diffabs.compiler.lane_programs import LanePrograms
 from diffabs.compiler.program import ScalarProgram
@@ -51,6 +56,7 @@ def run_lanes(
     rounds: int,
     read: object = None,
     tangents_read: object = None,
+    replay: tuple[Callable[[PyTree, PyTree], PyTree], PyTree] | None = None,
 ) -> PyTree:
     """Return the carry of n lanes after all have ended (pytree, leading axis n), with the structure of `carry`.
 
@@ -58,8 +64,8 @@ def run_lanes(
     whether the lane goes on. So every lane computes at least `rounds` * `steps` steps, even if `running` is false for
     its initial carry. A lane that never ends keeps the call from returning.
 
-    The function works under jit and vmap, with forward-mode derivatives. Arrays that the functions close over are the
-    same for all lanes.
+    The function works under jit and vmap, with forward-mode derivatives, and with reverse mode if there is a `replay`
+    (on a processor). Arrays that the functions close over are the same for all lanes.
 
     Args:
         renew: Function of one lane, (lane, carry) -> carry, called before every `steps` steps.
@@ -74,17 +80,21 @@ def run_lanes(
             influences none of these, nor `running`, may be returned with its initial values.
         tangents_read: Pytree of booleans like `carry`: arrays whose derivatives matter afterwards, None for all. The
             derivatives of an array that influences none of these may be returned as zero.
+        replay: Function of one lane, (lane, carry) -> carry, and a pytree like `carry` with True for one boolean array.
+            Where this array is True after a step, the function repeats the step: it takes the arrays that it changes
+            from before the step, and the others from after it. It must hold all derivatives of a step: those of
+            `renew` are zero, and arrays that it does not change have none.
 
     Raises:
         Unsupported: A function uses an operation without a lowering rule, has too many operations, or the carry mixes
             real types.
         NoCompiler: There is no compiler for the processor or GPU, or it does not compile the program.
-        ValueError: Reverse mode or a second derivative is requested.
+        ValueError: A second derivative is requested, or reverse mode without a `replay`.
     """
     if not gpu.find_gpu():
         toolchain.find_compiler()
     functions = trace_functions(
-        {"renew": renew, "step": step, "running": running},
+        {"renew": renew, "step": step, "running": running} | ({"replay": replay[0]} if replay else {}),
         jax.tree.map(_lane_type, lane),
         jax.tree.map(_lane_type, carry),
     )
@@ -96,7 +106,13 @@ def run_lanes(
         return None if mask is None else tuple(i for i, on in enumerate(jax.tree.leaves(mask)) if on)
 
     # Drop the traced arrays: this object outlives the trace, and a tracer must not leak. They are arguments instead.
-    lanes = LanePrograms(functions._replace(uniform=[]), launch, true_leaves(tangents_read), true_leaves(read))
+    part = None
+    if replay and not gpu.find_gpu():
+        part = functions.each["replay"], jax.tree.leaves(replay[1]).index(True)
+    functions = functions._replace(
+        uniform=[], each={name: functions.each[name] for name in ("renew", "step", "running")}
+    )
+    lanes = LanePrograms(functions, launch, true_leaves(tangents_read), true_leaves(read), part)
     results = bind_lanes(lanes, arguments)
     return tree.unflatten(
         [jax.random.wrap_key_data(x) if is_key(leaf) else x for x, leaf in zip(results, leaves, strict=True)]
@@ -104,14 +120,16 @@ def run_lanes(
 
 
 def _launch_lanes(
-    program: ScalarProgram, before: list[PyTree], carry: list[PyTree], shape: LaunchShape
+    program: ScalarProgram | Sweeps, before: list[PyTree], carry: list[PyTree], shape: LaunchShape
 ) -> list[PyTree]:
     """Build a program and return the carry after all lanes have ended, as an operation of XLA.
 
-    `before` holds the uniform arrays and then the arrays of the lanes.
+    `before` holds the uniform arrays and then the arrays of the lanes; in reverse mode then the carry, and `carry` the
+    cotangents and sums.
     """
     first, results = len(before), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
     if gpu.find_gpu():
+        assert isinstance(program, ScalarProgram)
         return gpu.call_kernel(program, shape, [*before, *carry], results)
     call = jax.ffi.ffi_call(
         cpu.build_target(program, shape),

@@ -81,10 +81,10 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
     return check_size(program, len(graph.nodes))
 
 
-def check_size(program: ScalarProgram, operations: int) -> ScalarProgram:
-    """Return the program unchanged, or raise Unsupported if its graph has more than MAX_OPERATIONS nodes."""
-    if operations > MAX_OPERATIONS:
-        raise Unsupported("step", f"of {operations} operations; {MAX_OPERATIONS} are the most")
+def check_size(program: ScalarProgram, operations: int, limit: int = MAX_OPERATIONS) -> ScalarProgram:
+    """Return the program unchanged, or raise Unsupported if it has more than `limit` operations."""
+    if operations > limit:
+        raise Unsupported("step", f"of {operations} operations; {limit} are the most")
     return program
 
 

@@ -74,8 +74,9 @@ def run_batch(
         engine: "xla" compiles with XLA. "kernel" translates the loop's step to a program of this machine. It needs a
             C++ compiler on a processor, and NVRTC, which JAX brings, on an NVIDIA GPU. It returns the same numbers to
             rounding and has first derivatives in both modes, but no trajectories. "auto" uses a kernel where possible.
-            It uses XLA for second derivatives, for reverse mode by more than 64 numbers of a run, for concrete runs
-            that step together, and for runs that lie on several devices or on one of another kind than JAX's default.
+            It uses XLA for second derivatives, for reverse mode by more than 32 numbers of a run (not with adaptive
+            steps on a processor), for concrete runs that step together, and for runs that lie on several devices or on
+            one of another kind than JAX's default.
             It also uses XLA if a kernel is impossible. The log says so. The environment variable `DIFFABS_ENGINE`
             replaces "auto" by "xla" or "kernel".
 

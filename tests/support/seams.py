@@ -32,6 +32,8 @@ SEAMS = {
     "members": "diffabs.output.explore.curves.MEMBERS",
     "identify": "diffabs.tune.identify.noise.identify",
     "max_cache_bytes": "diffabs.compiler.runtime.library_cache.MAX_CACHE_BYTES",
+    "max_log_bytes": "diffabs.compiler.emit.sweeps.MAX_LOG_BYTES",
+    "max_sweep_operations": "diffabs.compiler.autodiff.transpose.MAX_SWEEP_OPERATIONS",
     "cpp_flags": "diffabs.compiler.runtime.toolchain.CPP_FLAGS",
     "probe_timeout_s": "diffabs.compiler.runtime.toolchain.PROBE_TIMEOUT_S",
     "compile": "diffabs.compiler.runtime.toolchain._compile",

@@ -144,19 +144,32 @@ class Text:
         sizes = self.program.sizes
         counts = zip(("UNIFORM", "OF_LANES", "CARRIED"), (len(sizes[level]) for level in sizes), strict=True)
         yield "enum { " + ", ".join(f"{name} = {count}" for name, count in counts) + " };"
+        yield "enum { FIRST = UNIFORM + OF_LANES, RESULTS = CARRIED };"
+        yield self.widths(0)
+        yield from self.functions(("renew", "step"))
+        yield from self.running_function()
+        yield f"enum {{ STEPS = {self.shape.steps}, ROUNDS = {self.shape.rounds} }};"
+        yield self.DRIVER
+
+    def widths(self, first: int) -> str:
+        """Return the table of the bytes of one lane in each array of the carry, from array `first` on."""
         kinds = {place.array: scalar_type(node.dtype) for place, node in self._given_inputs(UpdateLevel.STEP)}
-        widths = [f"{size}*sizeof({kinds.get(i, 'u8')})" for i, size in enumerate(sizes[UpdateLevel.STEP])]
+        widths = [
+            f"{size}*sizeof({kinds.get(i, 'u8')})"
+            for i, size in enumerate(self.program.sizes[UpdateLevel.STEP])
+            if i >= first
+        ]
         # An array without entries has no node to take the type from. Its width is 0 in any type.
-        yield f"static const i64 WIDTHS[] = {{{', '.join(map(str, widths))}}};"
+        return f"static const i64 WIDTHS[] = {{{', '.join(map(str, widths))}}};"
+
+    def functions(self, names: Sequence[str]) -> Iterator[str]:
+        """Yield the structs and functions of a program; `names` are those that update the carry."""
         yield from self._structures()
         yield from self._prepare()
         yield from self._begin()
-        for name in ("renew", "step"):
+        for name in names:
             yield from self._function(name)
-        yield from self._running_function()
         yield from self._put_and_take()
-        yield f"enum {{ STEPS = {self.shape.steps}, ROUNDS = {self.shape.rounds} }};"
-        yield self.DRIVER
 
     def _given_inputs(self, level: UpdateLevel) -> list[tuple[InputPlace, Node]]:
         """Return the inputs of a level that the results depend on; for STEP all inputs of the carry."""
@@ -165,6 +178,10 @@ class Text:
             for p, n in self.program.inputs.items()
             if p.level == level and (level == UpdateLevel.STEP or n.id in self.alive)
         ]
+
+    def _array_inputs(self, level: UpdateLevel) -> list[tuple[InputPlace, Node]]:
+        """Return the inputs of a level that `put` reads and, for STEP, `take` returns."""
+        return self._given_inputs(level)
 
     def _structures(self) -> Iterator[str]:
         """Yield the structs `Shared`, with values of all lanes, and `Block`, with the carry and values of each lane."""
@@ -216,7 +233,7 @@ class Text:
                     yield f"  b.c{c.id}[{q}] = {self._name(r, q)};"
         yield "}"
 
-    def _running_function(self) -> Iterator[str]:
+    def running_function(self) -> Iterator[str]:
         """Yield static void running(const Block&, const Shared&, mask*), which tells for each lane if it continues."""
         (root,) = self.program.results["running"]
         yield "PART void running(const Block& b, const Shared& s, mask* on) { (void)b; (void)s;"
@@ -259,14 +276,14 @@ class Text:
         yield "PART void put(Block& b, int p, i64 j, const Array* lanes, const Array* carry) {"
         yield "  const int i = p/LANES, q = p%LANES; (void)lanes;"
         for places, name, array in ((UpdateLevel.LANE, "l", "lanes"), (UpdateLevel.STEP, "c", "carry")):
-            for place, node in self._given_inputs(places):
+            for place, node in self._array_inputs(places):
                 size = self.program.sizes[places][place.array]
                 value = f"((const {scalar_type(node.dtype)}*){array}[{place.array}].data)[j*{size} + {place.entry}]"
                 target = f"b.{name}{node.id}[i]"
                 yield f"  set({target}, q, {value});" if node.dtype == bool else f"  place({target}, q, {value});"
         yield "}\nPART void take(const Block& b, int p, i64 j, const Array* carry) {"
         yield "  const int i = p/LANES, q = p%LANES;"
-        for place, node in self._given_inputs(UpdateLevel.STEP):
+        for place, node in self._array_inputs(UpdateLevel.STEP):
             size, value = self.program.sizes[UpdateLevel.STEP][place.array], f"b.c{node.id}[i]"
             value = f"get({value}, q)" if node.dtype == bool else f"at({value}, q)"
             yield f"  (({scalar_type(node.dtype)}*)carry[{place.array}].data)[j*{size} + {place.entry}] = {value};"

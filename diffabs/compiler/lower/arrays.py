@@ -174,3 +174,10 @@ def _dot(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
         for term in terms[1:]:
             out[i, j] = graph.op("add", out[i, j], term)
     return [out.reshape(eqn.outvars[0].aval.shape)]
+
+
+@lowering_rule("empty empty2", "dtype memory_space shape out_sharding")
+def _empty(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray]:
+    """Return zeros for an array without values, which a branch of a conditional leaves to the other one."""
+    kind = eqn.outvars[0].aval
+    return [constant_array(graph, np.zeros(kind.shape, kind.dtype))]

@@ -62,9 +62,10 @@ def _gather(graph: Graph, eqn: JaxprEqn, ins: list[NodeArray]) -> list[NodeArray
         and n.offset_dims == tuple(range(places.ndim - 1, places.ndim - 2 + x.ndim))
         and p["slice_sizes"] == (1, *x.shape[1:])
     )
-    # Both modes allow `_part` to clamp the index. FILL_OR_DROP would need a fill value.
-    mode = str(p["mode"]).rsplit(".", 1)[-1]
-    if not simple or mode not in ("PROMISE_IN_BOUNDS", "CLIP"):
+    # Both modes allow `_part` to clamp the index. FILL_OR_DROP would need a fill value for an index outside.
+    mode, last = str(p["mode"]).rsplit(".", 1)[-1], len(x) - 1
+    inside = all(i.op == "const" and 0 <= i.attr <= last for i in places.flat)
+    if not simple or not (inside or mode in ("PROMISE_IN_BOUNDS", "CLIP")):
         raise Unsupported("gather", f"with {n}, {mode}")
     out = np.empty((*places.shape[:-1], *x.shape[1:]), object)
     for at in np.ndindex(places.shape[:-1]):

@@ -6,7 +6,9 @@ import threading
 
 import jax
 
+from diffabs.compiler.autodiff.transpose import Sweeps
 from diffabs.compiler.emit import cpp
+from diffabs.compiler.emit.sweeps import emit_sweeps
 from diffabs.compiler.listing import count_by_level
 from diffabs.compiler.program import ScalarProgram
 from diffabs.compiler.runtime import toolchain
@@ -19,11 +21,13 @@ _lock = threading.Lock()
 _loaded: dict[str, PyTree] = {}
 
 
-def build_target(program: ScalarProgram, shape: cpp.LaunchShape) -> str:
+def build_target(program: ScalarProgram | Sweeps, shape: cpp.LaunchShape) -> str:
     """Return the name of a program's FFI target of XLA; compile and register the program if necessary.
 
-    A large program, or one with tangents, gets fewer vectors than `shape` says.
+    A large program, or one with derivatives, gets fewer vectors than `shape` says.
     """
+    if isinstance(program, Sweeps):
+        return register_library(toolchain.build_library(emit_sweeps(program, shape._replace(vectors=1))))
     # Tangents are independent of each other too and hide latency, so they replace vectors of the block.
     vectors = shape.vectors // max(1, program.tangents)
     operations = count_by_level(program)["step"]

@@ -1,8 +1,11 @@
-"""The JAX primitive `run_lanes`: rules for jit, vmap and forward-mode derivatives of a kernel launch.
+"""The JAX primitives `run_lanes` and `pull_lanes`: rules for jit, vmap and derivatives of a kernel launch.
 
 The primitive's parameters are `lanes` (the programs), `seeds` (arrays with an initial tangent), `many` (tangent
 directions) and `as_lanes` (uniform arrays with a value per lane). Its arguments are the values and then the initial
 tangents, its results those of `LanePrograms.result_keys`.
+
+`pull_lanes` is the transpose of `run_lanes`. Its arguments are the values and the cotangents of the carry at the end,
+its results the cotangents of the seeds, one for each lane.
 
 vmap adds lanes: a uniform array that differs within the batch becomes an array of each lane. If only tangents are
 batched, as in `jax.jacfwd`, the lanes stay and the batch becomes more tangent directions. Only this module uses JAX's
@@ -11,8 +14,8 @@ interfaces for new primitives.
 
 import functools
 import math
-from collections.abc import Sequence
-from typing import Any, NoReturn
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.extend.core as jex
@@ -21,6 +24,7 @@ from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 
 from diffabs.compiler.autodiff.jvp import ArrayKey, arrange_arrays
+from diffabs.compiler.autodiff.transpose import moved_keys
 from diffabs.compiler.ir import UpdateLevel, is_real
 from diffabs.compiler.lane_programs import LanePrograms, Seeds
 from diffabs.core.types import Array, PyTree, Scalar
@@ -32,7 +36,8 @@ NO_REVERSE_MODE = (
 
 
 run_lanes_primitive = jex.Primitive("run_lanes")
-run_lanes_primitive.multiple_results = True
+pull_lanes_primitive = jex.Primitive("pull_lanes")
+run_lanes_primitive.multiple_results = pull_lanes_primitive.multiple_results = True
 
 
 def bind_lanes(lanes: LanePrograms, arrays: Sequence[PyTree]) -> list[PyTree]:
@@ -43,10 +48,13 @@ def bind_lanes(lanes: LanePrograms, arrays: Sequence[PyTree]) -> list[PyTree]:
     return run_lanes_primitive.bind(*arrays, lanes=lanes, seeds=None, many=0, as_lanes=frozenset())
 
 
-@run_lanes_primitive.def_impl
-def _run(*arrays: Array, **how: Any) -> list[PyTree]:
-    # The primitive has a lowering but no eager evaluation, so a call outside jit compiles as well.
-    return jax.jit(functools.partial(run_lanes_primitive.bind, **how))(*arrays)
+def _compile_call(primitive: jex.Primitive, *arrays: Array, **how: Any) -> list[PyTree]:
+    # The primitives have lowerings but no eager evaluation, so a call outside jit compiles as well.
+    return jax.jit(functools.partial(primitive.bind, **how))(*arrays)
+
+
+for _primitive in (run_lanes_primitive, pull_lanes_primitive):
+    _primitive.def_impl(functools.partial(_compile_call, _primitive))
 
 
 @run_lanes_primitive.def_abstract_eval
@@ -100,12 +108,42 @@ def _launch_in_parts(
 mlir.register_lowering(run_lanes_primitive, mlir.lower_fun(_launch_in_parts, multiple_results=True))
 
 
+@pull_lanes_primitive.def_abstract_eval
+def _pulled_shapes(*arrays: PyTree, lanes: LanePrograms, seeds: Seeds, as_lanes: frozenset[int]) -> list[PyTree]:
+    """Return the shapes and types of the cotangents of the seeds, (lanes, ...) also those of uniform arrays."""
+    del as_lanes
+    like, types = arrays[len(lanes.value_keys)], [lanes.functions.types[level][i] for level, i in seeds or ()]
+    return [like.update(shape=(like.shape[0], *x.shape), dtype=x.dtype, weak_type=False) for x in types]
+
+
+def _launch_sweeps(*arrays: Array, lanes: LanePrograms, seeds: Seeds, as_lanes: frozenset[int]) -> list[PyTree]:
+    """Return the results of `pull_lanes`: the cotangents of the seeds in each lane."""
+    values, ends = arrays[: len(lanes.value_keys)], arrays[len(lanes.value_keys) :]
+    arrays_by_key = dict(zip(lanes.value_keys, values, strict=True))
+    order = arrange_arrays(lanes.functions, lanes.derivative(None).moved_arrays, as_lanes)
+    before = [arrays_by_key[key] for level in UpdateLevel if level in order for key in order[level]]
+    moved, kinds = moved_keys(lanes.derivative(seeds).moved_arrays), lanes.functions.types
+    # Sums begin at zero. A number of the initial carry that moves no result has no cotangent in the program: zero.
+    zeros = {
+        key: jnp.zeros((len(ends[0]), *kinds[key.level][key.number].shape), kinds[key.level][key.number].dtype)
+        for key in lanes.seed_keys(seeds)
+    }
+    moved_arrays = [*ends, *(zeros[key] for key in moved[len(ends) :])]
+    pulled = lanes.launch(lanes.sweeps(seeds, as_lanes), before, moved_arrays)
+    results = zeros | dict(zip(moved, pulled, strict=True))
+    return [results[key] for key in zeros]
+
+
+mlir.register_lowering(pull_lanes_primitive, mlir.lower_fun(_launch_sweeps, multiple_results=True))
+
+
 def build_launches(program: Any) -> None:
     """Build the kernels that a jaxpr calls, so that an error appears before XLA compiles it."""
+    launches = {run_lanes_primitive: _launch_in_parts, pull_lanes_primitive: _launch_sweeps}
     for equation in program.eqns:
-        if equation.primitive is run_lanes_primitive:
+        if equation.primitive in launches:
             types = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
-            jax.eval_shape(functools.partial(_launch_in_parts, **equation.params), *types)
+            jax.eval_shape(functools.partial(launches[equation.primitive], **equation.params), *types)
     for inner in jex.subjaxprs(program):
         build_launches(inner)
 
@@ -163,6 +201,7 @@ def _jvp_rule(
 
 
 ad.primitive_jvps[run_lanes_primitive] = _jvp_rule
+ad.primitive_jvps[pull_lanes_primitive] = functools.partial(_jvp_rule, many=1)  # refuses: a pull has seeds
 
 
 def _zero_tangent(x: Scalar) -> ad.Zero:
@@ -202,6 +241,40 @@ def _batching_rule(
         return results, [1 if key.tangent else None for key in lanes.result_keys(seeds)]
 
     keys = [*lanes.value_keys, *lanes.seed_keys(seeds)]
+    arguments, batched_uniforms, split = _merge_into_lanes(lanes, keys, as_lanes, arrays, axes)
+    outs = run_lanes_primitive.bind(*arguments, **how, many=many, as_lanes=as_lanes | batched_uniforms)
+    return [split(x) for x in outs], [0] * len(outs)
+
+
+batching.primitive_batchers[run_lanes_primitive] = _batching_rule
+
+
+def _pull_batching_rule(
+    arrays: Sequence[PyTree], axes: Sequence[PyTree], *, lanes: LanePrograms, seeds: Seeds, as_lanes: frozenset[int]
+) -> tuple[list[Array], Sequence[int | None]]:
+    """Return the results for a batch, whose axis is merged into the axis of lanes, and their batch axes."""
+    keys = [*lanes.value_keys, *(key for key in lanes.result_keys(seeds) if key.tangent)]
+    arguments, batched_uniforms, split = _merge_into_lanes(lanes, keys, as_lanes, arrays, axes)
+    outs = pull_lanes_primitive.bind(*arguments, lanes=lanes, seeds=seeds, as_lanes=as_lanes | batched_uniforms)
+    return [split(x) for x in outs], [0] * len(outs)
+
+
+batching.primitive_batchers[pull_lanes_primitive] = _pull_batching_rule
+
+
+def _merge_into_lanes(
+    lanes: LanePrograms,
+    keys: list[ArrayKey],
+    as_lanes: frozenset[int],
+    arrays: Sequence[PyTree],
+    axes: Sequence[PyTree],
+) -> tuple[list[Array], set[int], Callable[[Array], Array]]:
+    """Return the arrays of a batch with its axis merged into that of lanes.
+
+    Also return the numbers of the uniform arrays that differ within it, and the function that splits a result again.
+    """
+    values = len(lanes.value_keys)
+    size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
     batched_uniforms = {
         k.number for k, axis in zip(keys, axes, strict=True) if k.level == UpdateLevel.UNIFORM and axis is not None
     }
@@ -218,24 +291,49 @@ def _batching_rule(
                 x = jnp.broadcast_to(x[:, None], (size, count, *x.shape[1:]))
             x = x.reshape(size * count, *x.shape[2:])  # not -1: an array may be empty
         arguments.append(x)
-    outs = run_lanes_primitive.bind(*arguments, **how, many=many, as_lanes=as_lanes | batched_uniforms)
-    return [x.reshape(size, count, *x.shape[1:]) for x in outs], [0] * len(outs)
+    return arguments, batched_uniforms, lambda x: x.reshape(size, count, *x.shape[1:])
 
 
-batching.primitive_batchers[run_lanes_primitive] = _batching_rule
+def _linearize(trace: Any, *tracers: Any, lanes: LanePrograms, **how: Any) -> Sequence[Any]:
+    """Return the results for known values and unknown tangents: known values, and tangents to be transposed.
+
+    JAX asks for it in `jax.grad`, `jax.vjp` and `jax.linearize`.
+    """
+    if lanes.replay is None:
+        raise ValueError(NO_REVERSE_MODE)
+    known_values = [tracer.pval.get_known() for tracer in tracers]
+    values = known_values[: len(lanes.value_keys)]
+    outs = trace.default_process_primitive(run_lanes_primitive, tracers, {"lanes": lanes, **how})
+    if any(x is None for x in values) or all(x is not None for x in known_values):
+        return outs
+    lanes.sweeps(how["seeds"], how["as_lanes"])  # an error appears before JAX transposes
+    results = run_lanes_primitive.bind(*values, lanes=lanes, seeds=None, many=0, as_lanes=how["as_lanes"])
+    return [*map(trace.to_jaxpr_tracer, results), *outs[len(results) :]]
 
 
-def _refuse_partial_evaluation(trace: object, *tracers: object, **how: object) -> NoReturn:
-    """Raise ValueError: JAX linearizes the kernel (`jax.grad`, `jax.linearize`), and no reverse mode exists."""
-    del trace, tracers, how
-    raise ValueError(NO_REVERSE_MODE)
+def _transpose(
+    cotangents: Sequence[PyTree],
+    *arrays: PyTree,
+    lanes: LanePrograms,
+    seeds: Seeds,
+    many: int,
+    as_lanes: frozenset[int],
+) -> list[PyTree]:
+    """Return the cotangents of the initial tangents; each direction is a lane of its own."""
+    values, tangents = arrays[: len(lanes.value_keys)], arrays[len(lanes.value_keys) :]
+    ends = [ad.instantiate_zeros(x) for x in cotangents[len(lanes.functions.types[UpdateLevel.STEP]) :]]
+
+    def pull(*ends: Array) -> list[PyTree]:
+        return pull_lanes_primitive.bind(*values, *ends, lanes=lanes, seeds=seeds, as_lanes=as_lanes)
+
+    results: list[PyTree] = [None] * len(values)
+    pulled = jax.vmap(pull, in_axes=1, out_axes=1)(*ends)
+    for key, tangent, x in zip(lanes.seed_keys(seeds), tangents, pulled, strict=True):
+        shared = key.level == UpdateLevel.UNIFORM and key.number not in as_lanes
+        total = jnp.sum(x, 0) if shared else x
+        results.append(total if ad.is_undefined_primal(tangent) else None)
+    return results
 
 
-def _refuse_transpose(*args: object, **how: object) -> NoReturn:
-    """Raise ValueError: JAX transposes the kernel, and no reverse mode exists."""
-    del args, how
-    raise ValueError(NO_REVERSE_MODE)
-
-
-pe.custom_partial_eval_rules[run_lanes_primitive] = _refuse_partial_evaluation
-ad.primitive_transposes[run_lanes_primitive] = _refuse_transpose
+pe.custom_partial_eval_rules[run_lanes_primitive] = _linearize
+ad.primitive_transposes[run_lanes_primitive] = _transpose

@@ -6,7 +6,8 @@ and its rules decide as late as JAX allows:
     values                 when XLA compiles the program: a kernel for a batch, XLA for a single run
     forward mode           when XLA compiles the program: a kernel
     reverse mode           when JAX linearizes: a kernel's Jacobian, by forward directions, if a run has few inputs;
-                           else XLA's vector-Jacobian product
+                           a kernel's backward sweep, if a run with adaptive steps has more than one launch has
+                           directions; else XLA's vector-Jacobian product
     second derivatives     XLA
 
 Where a kernel is impossible, XLA makes everything.
@@ -41,9 +42,11 @@ from diffabs.core.jax_flags import default_flags
 from diffabs.core.types import Array, PyTree
 from diffabs.engine.drive.engine import EngineError, check_process, describe_engine, is_forked
 from diffabs.engine.hybrid import Finish
+from diffabs.engine.step.adaptive import AdaptiveStepping
 from diffabs.host.process import default_platform
 
 MIN_RUNS = 2  # runs whose values a kernel makes on a processor: one run waits longer for its compiler than for XLA
+MIN_SWEEP_INPUTS = 9  # inputs of a run from which a kernel's sweep costs less than its Jacobian, then of two launches
 MAX_DIRECTIONS = 32  # inputs of a run up to which a kernel's Jacobian costs about what XLA's reverse mode does
 MANY_INPUTS_REASON = f"a run has more than {MAX_DIRECTIONS} inputs"
 MAX_KEPT_PROGRAMS = 64  # traced kernels that are kept, by the structure and the shapes of their runs
@@ -73,6 +76,12 @@ class DeferredRun(NamedTuple):
     plan: Any
     by_xla: Callable[[Any, PyTree], PyTree]
     required: bool
+
+    @property
+    def adaptive(self) -> bool:
+        """True if the steps are adaptive: then a kernel has a backward sweep."""
+        _, _, method, _ = jax.tree.unflatten(self.structure, range(len(self.key_kinds)))
+        return isinstance(method, AdaptiveStepping)
 
     def call_xla(self, *leaves: Array) -> list[PyTree]:
         """Return the leaves of the run by XLA."""
@@ -432,6 +441,8 @@ def _linearize(trace: Any, *tracers: Any, **named: Any) -> Sequence[Any]:
     leaves, tangents = known_values[: call.leaf_count], tracers[call.leaf_count :]
     if any(x is None for x in leaves) or all(x is not None for x in known_values):
         return trace.default_process_primitive(derivative_primitive, tracers, named)
+    if results := _sweep(trace, call, tracers):
+        return results
     if not _has_cheap_jacobian(call, leaves):
         with jex.set_current_trace(trace):
             return [trace.to_jaxpr_tracer(x) for x in call.vectorize(call.deferred.call_xla)(*tracers)]
@@ -473,9 +484,30 @@ def _split_for_checkpoint(
     return known_equation, equation, unknown_results, [True] * len(results), residuals
 
 
+def _sweep(trace: Any, call: _Call, tracers: Leaves) -> list[Any]:
+    """Return what `_linearize` does by a kernel, which JAX then transposes.
+
+    Return [] if a kernel cannot, or if something else costs less: few inputs, or fixed steps.
+    """
+    from diffabs.compiler.lower.rules import Unsupported
+    from diffabs.compiler.runtime.toolchain import NoCompiler
+
+    leaves = [tracer.pval.get_known() for tracer in tracers[: call.leaf_count]]
+    few = _count_inputs(call, leaves) < MIN_SWEEP_INPUTS
+    if few or not call.deferred.adaptive or any(map(_has_tangent, leaves)) or _placement_objection((), 1):
+        return []
+    try:
+        with jex.set_current_trace(trace):
+            results = [trace.to_jaxpr_tracer(x) for x in call.vectorize(call.deferred.call_kernel)(*tracers)]
+    except (Unsupported, NoCompiler):
+        return []
+    _log_choice("reverse mode", "")
+    return results
+
+
 def _has_cheap_jacobian(call: _Call, leaves: Leaves) -> bool:
     """Return whether a kernel's Jacobian of each run costs less than XLA's vector-Jacobian product."""
-    directions, objection = sum(map(math.prod, _input_shapes(call, leaves))), _placement_objection((), 1)
+    directions, objection = _count_inputs(call, leaves), _placement_objection((), 1)
     if not call.deferred.required and any(map(_has_tangent, leaves)):
         objection = objection or "it has second derivatives"
     if not call.deferred.required and directions > MAX_DIRECTIONS:
@@ -488,6 +520,11 @@ def _has_cheap_jacobian(call: _Call, leaves: Leaves) -> bool:
     if objection:
         _log_choice("reverse mode", objection)
     return program is not None
+
+
+def _count_inputs(call: _Call, leaves: Leaves) -> int:
+    """Return the number of inputs of one run that have a tangent."""
+    return sum(map(math.prod, _input_shapes(call, leaves)))
 
 
 def _input_shapes(call: _Call, leaves: Leaves) -> list[tuple[int, ...]]:

@@ -141,7 +141,14 @@ def _run(
     def judge(lane_leaves: object, carry: object) -> PyTree:
         return finish(*build_lane(lane_leaves), carry)[0]
 
+    def repeat(lane: tuple[PyTree, ...], carry: PyTree) -> PyTree:
+        return method.repeat(*build_lane(lane[0]), lane[1], carry)
+
     begins = jax.vmap(start)(leaves, keys, accepted)
+    replay = None
+    if isinstance(begins, LaggedReplay):
+        no = jax.tree.map(lambda _: False, begins)
+        replay = repeat, no._replace(entry=no.entry._replace(accepted=True))
     _check_logs(hybrid, begins.point.state)
     # The kernel computes only leaves of the carry that the results depend on, and tangents that move the results.
     carry = run_lanes(
@@ -154,6 +161,7 @@ def _run(
         rounds=1 if enough is None else STEPS_PER_EXCHANGE // STEPS_PER_BLOCK,
         read=read_leaves(judge, leaves, begins),
         tangents_read=read_leaves(judge, leaves, begins, differentiably=True),
+        replay=replay,
     )
     return jax.vmap(judge)(leaves, carry)
 

@@ -198,10 +198,12 @@ class LaggedReplay(NamedTuple):
     Attributes:
         ahead: Carry of the run for values.
         behind: Carry of the replay.
+        entry: Log entry of the last attempt.
     """
 
     ahead: Carry
     behind: Carry
+    entry: StepLog
 
     running = property(lambda self: self.ahead.running, doc="True if the run for values needs another attempt.")
     slides = property(lambda self: self.ahead.slides, doc="Watch for slides of the run for values.")
@@ -225,19 +227,23 @@ class LaggedReplayStepping:
     def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> LaggedReplay:
         """Return the carry of a run at t = 0, from `hybrid`, `objectives` and random `key`."""
         ahead = self.live.start(_stop_gradients(hybrid), _stop_gradients(objectives), key)
-        return LaggedReplay(ahead, ReplayStepping(self.live).start(hybrid, objectives, key))
+        return LaggedReplay(ahead, ReplayStepping(self.live).start(hybrid, objectives, key), log_attempt(ahead, ahead))
 
     def step(self, hybrid: HybridSystem, objectives: Objectives, key: Key, carry: LaggedReplay) -> LaggedReplay:
         """Return the `carry` after one attempt of the run for values, and its replay if the attempt was accepted."""
         # The run ahead only chooses the steps. All derivatives pass through the replay.
         old = _stop_gradients(carry.ahead)
         new = _stop_gradients(self.live.step(_stop_gradients(hybrid), _stop_gradients(objectives), key, old))
-        entry, replay = log_attempt(old, new), ReplayStepping(self.live)
+        after = LaggedReplay(new, carry.behind, log_attempt(old, new))
 
         def repeat() -> Carry:
-            return replay.step(hybrid, objectives, key, carry.behind, entry)
+            return self.repeat(hybrid, objectives, key, after).behind
 
-        return LaggedReplay(new, jax.lax.cond(any_lane(entry.accepted), repeat, lambda: carry.behind))
+        return after._replace(behind=jax.lax.cond(any_lane(after.entry.accepted), repeat, lambda: after.behind))
+
+    def repeat(self, hybrid: HybridSystem, objectives: Objectives, key: Key, carry: LaggedReplay) -> LaggedReplay:
+        """Return the `carry` after the replay of its last attempt. Only this part of a step has derivatives."""
+        return carry._replace(behind=ReplayStepping(self.live).step(hybrid, objectives, key, carry.behind, carry.entry))
 
     def renew(self, hybrid: HybridSystem, carry: LaggedReplay) -> LaggedReplay:
         """Return the `carry` with a new stability limit of the `hybrid` if the last one is too old."""
