@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 
 from diffabs.cli import progress
+from diffabs.core import channels
 from diffabs.engine.drive.engine import EngineError
 from diffabs.host import files, interrupt
 from diffabs.host.values import ScenarioError
@@ -146,6 +147,14 @@ def conclude(line: str) -> NoReturn:
 def is_animated() -> bool:
     """Return True if stderr shows a spinner."""
     return progress.can_redraw(Console(stderr=True))
+
+
+def refuse_several_controls(scenario: Scenario, who: str) -> None:
+    """Raise ScenarioError if the plant has several controls and `who`, a command, can use only one."""
+    try:
+        channels.need_single_control(scenario.loop.plant, who)
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from diffabs.host import documents, provenance
 from diffabs.host.separated import read_decimal
 from diffabs.host.values import ScenarioError, format_given
 from diffabs.scenario.parameter_paths import parameters_of, read_fixed_values
-from diffabs.scenario.robustness import ScenarioMargins, examine_margins
+from diffabs.scenario.robustness import ScenarioChannelMargins, ScenarioMargins, examine_margins
 from diffabs.scenario.scenario import Scenario
 
 MOST_SAMPLES = 10_000
@@ -43,12 +43,15 @@ def margins(
 ) -> None:
     """Compute stability margins of the linearised loop.
 
-    It shows gain, phase, delay and modulus margin of the scenario, and the worst over [design.over]."""
+    It shows gain, phase, delay and modulus margin of the scenario, and the worst over [design.over]. A plant with
+    several controls has them for each channel, with the others closed, and the least singular value of I + L."""
     with console.end_on_errors():
         targets.check_picture(plot)
         with targets.new_target_file(plot, "--plot") as picture:
             setup = console.load_scenario(scenario, changes, integrated=False)
             values, target = _read_places(setup, at or ())
+            if picture or setup.design.over:
+                console.refuse_several_controls(setup, "margins --plot" if picture else "margins over [design.over]")
             try:
                 margin_results = console.run_with_progress(
                     lambda: examine_margins(setup, values, target, samples), f"linearising {setup.name}"
@@ -59,8 +62,11 @@ def margins(
                 console.fail(f"{setup.name}: {error}", console.FAILED)
             result = {"scenario": setup.name, **margin_results.record(), "versions": provenance.versions(), "files": {}}
             result = documents.stamp("margins", result)
-            show_result = partial(show.show_result, as_json, show_margins.show_margins, result, setup, margin_results)
-            if picture:
+            view = show_margins.show_margins
+            if isinstance(margin_results, ScenarioChannelMargins):
+                view = show_margins.show_channel_margins
+            show_result = partial(show.show_result, as_json, view, result, setup, margin_results)
+            if picture and isinstance(margin_results, ScenarioMargins):
                 with console.show_before_errors(show_result):
                     console.run_with_progress(lambda: _draw(setup, margin_results, picture), "drawing")
         result["files"] |= {"plot": str(plot)} if plot else {}
@@ -94,8 +100,12 @@ def _draw(scenario: Scenario, margins: ScenarioMargins, picture: pathlib.Path) -
     frequency.loop_shape(margins.nominal.loop, margins.nominal.margins, loops, title=title).savefig(picture)
 
 
-def _judge(scenario: Scenario, margins: ScenarioMargins) -> None:
+def _judge(scenario: Scenario, margins: ScenarioMargins | ScenarioChannelMargins) -> None:
     """Raise typer.Exit for a loop that is unstable, here or within the ranges."""
+    if isinstance(margins, ScenarioChannelMargins):
+        if not margins.margins.stable:
+            console.conclude(f"{scenario.name}: the closed loop is not stable: no margins")
+        return
     if not margins.nominal.margins.stable:
         console.conclude(f"{scenario.name}: the closed loop is not stable: no margins")
     if unstable := margins.band.unstable:

@@ -58,6 +58,7 @@ def prove(
         from diffabs.scenario.proofs import prove_box
 
         setup = console.load_scenario(scenario, changes or (), integrated=False)
+        console.refuse_several_controls(setup, "prove")
         sides = _read_sides(over, setup)
         box = {side.path: side.ends for side in sides}
         if plot:

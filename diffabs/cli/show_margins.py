@@ -6,16 +6,20 @@ from rich.table import Table
 
 from diffabs.cli import console, show, tables
 from diffabs.core.types import JsonObject
-from diffabs.linear.robustness import System
+from diffabs.linear.stability_margins import Margins
 from diffabs.scenario.parameter_paths import parameters_of
 from diffabs.scenario.registry import KMH
-from diffabs.scenario.robustness import ScenarioMargins
+from diffabs.scenario.robustness import ScenarioChannelMargins, ScenarioMargins
 from diffabs.scenario.scenario import Scenario
 
 MARGIN_NAMES = {
     **{"gain_up": "gain may rise to, times", "gain_down": "gain may fall to, times", "phase": "phase margin [deg]"},
     **{"delay": "delay margin [ms]", "modulus": "modulus margin, 1/Ms", "sensitivity": "greatest |S|, Ms"},
     **{"complementary": "greatest |T|, Mt", "crossover": "crossover [rad/s]"},
+}
+SHORT_NAMES = {
+    **{"gain_up": "gain up", "gain_down": "gain down", "phase": "phase [deg]", "delay": "delay [ms]"},
+    **{"modulus": "1/Ms", "complementary": "Mt", "crossover": "crossover [rad/s]"},
 }
 SHOWN_IN = {"phase": math.degrees(1), "delay": 1e3}
 
@@ -25,23 +29,52 @@ def show_margins(result: JsonObject, scenario: Scenario, margins: ScenarioMargin
     worst = margins.band.worst()
     table = Table("margin", "here", *([f"worst of {len(margins.band.systems)}", "where"] if worst else []))
     for name, words in MARGIN_NAMES.items():
-        row = [_format_margin(name, margins.nominal)]
+        row = [_format_margin(name, margins.nominal.margins)]
         if system := worst.get(name):
-            row += [_format_margin(name, system), format_place(system.values, scenario)]
+            row += [_format_margin(name, system.margins), format_place(system.values, scenario)]
         table.add_row(words, *row)
+    tables.show_titled_table(_title(result, scenario), table)
+    _show_notes(result, scenario)
+
+
+def show_channel_margins(result: JsonObject, scenario: Scenario, margins: ScenarioChannelMargins) -> None:
+    """Show a table with a row for each channel, and one for all channels together at inputs and outputs."""
+    found = margins.margins
+    table = Table("channel", *SHORT_NAMES.values())
+    for channel, one in found.channels.items():
+        table.add_row(channel, *(_format_margin(name, one) for name in SHORT_NAMES))
+    tables.show_titled_table(f"{_title(result, scenario)}; a channel with the others closed", table)
+    table = Table("all channels", "least s(I + L)", "at [rad/s]", "Mt", "disk margin", "gains up", "phases [deg]")
+    for place, at in (("at the controls", found.input), ("at the outputs", found.output)):
+        if at:
+            values = (at.smallest, at.sensitivity_at, at.complementary, at.disk, at.gain[1], math.degrees(at.phase))
+            table.add_row(place, *map(_format_number, values))
+    tables.show_titled_table("All channels together", table)
+    console.say("s(I + L): singular value of the return difference, 1/Ms; disk margin: each channel changes by itself")
+    _show_notes(result, scenario)
+
+
+def _title(result: JsonObject, scenario: Scenario) -> str:
     when = f"sampled every {1e3 * result['period']:g} ms" if result["period"] else "in continuous time"
     delay = f", {1e3 * result['delay_in_the_loop']:g} ms of delay" if result["delay_in_the_loop"] else ""
-    tables.show_titled_table(f"{scenario.title or scenario.name}: the linearised loop, {when}{delay}", table)
+    return f"{scenario.title or scenario.name}: the linearised loop, {when}{delay}"
+
+
+def _show_notes(result: JsonObject, scenario: Scenario) -> None:
     if frozen := getattr(scenario.loop.plant, "frozen", ()):
         console.say(f"note: {' and '.join(frozen)} are held constant; limits are not included")
     show.show_files(result)
 
 
-def _format_margin(name: str, system: System) -> str:
-    value = system.margins.numbers()[name]
+def _format_margin(name: str, margins: Margins) -> str:
+    value = margins.numbers()[name]
     if math.isnan(value):
-        return "undecided" if name == "delay" and system.margins.stable else "none"
+        return "undecided" if name == "delay" and margins.stable else "none"
     return "no limit" if value == math.inf else f"{value * SHOWN_IN.get(name, 1.0):.4g}"
+
+
+def _format_number(value: float) -> str:
+    return "none" if math.isnan(value) else "infinity" if value == math.inf else f"{value:.4g}"
 
 
 def format_place(values: dict[str, float], scenario: Scenario) -> str:

@@ -56,6 +56,11 @@ def has_channels(signal: object) -> bool:
     return isinstance(signal, tuple) and hasattr(signal, "_fields")
 
 
+def control_names(plant: object) -> tuple[str, ...]:
+    """Return the names of a plant's controls; none for a plant with a single control."""
+    return getattr(getattr(plant, "controls", None), "_fields", ())
+
+
 def select_channel(signal: Any, name: str) -> Scalar:
     """Return one channel of a control or target; the signal of a loop with one channel is that channel."""
     if not has_channels(signal):

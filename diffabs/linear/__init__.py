@@ -12,6 +12,9 @@ from diffabs.linear.linearization import StateSpace as StateSpace
 from diffabs.linear.linearization import linearize as linearize
 from diffabs.linear.lyapunov import discrete_lyapunov as discrete_lyapunov
 from diffabs.linear.lyapunov import lyapunov as lyapunov
+from diffabs.linear.multivariable_margins import MultivariableMargins as MultivariableMargins
+from diffabs.linear.multivariable_margins import ReturnDifference as ReturnDifference
+from diffabs.linear.multivariable_margins import multivariable_margins as multivariable_margins
 from diffabs.linear.opened_loop import OpenLoop as OpenLoop
 from diffabs.linear.opened_loop import open_loop as open_loop
 from diffabs.linear.recoverable import recoverable_bound as recoverable_bound

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.linear.channel_loop import ChannelLoop
 from diffabs.linear.opened_loop import OpenLoop, sample_plant
-from diffabs.linear.transfer import Transfer
 from diffabs.linear.zero_order_hold import hold_input
 
 # Fractions of a period for the largest |L| and its rates: at least, per turn of the fastest pole, at most.
@@ -64,7 +64,7 @@ class _Curve(NamedTuple):
 class DelayedLoop:
     """The response of a sampled open loop as a function of its delay."""
 
-    def __init__(self, loop: OpenLoop, w: np.ndarray):
+    def __init__(self, loop: OpenLoop | ChannelLoop, w: np.ndarray):
         """Prepare the loop for all delays, from a grid of frequencies `w` (k,) [rad/s] that is refined.
 
         `largest` is then the largest |L| over all frequencies and delays.
@@ -106,12 +106,6 @@ class DelayedLoop:
         count = min(MAX_FRACTIONS, FRACTIONS + int(FRACTIONS_PER_TURN * turns))
         return self.period * np.union1d(np.linspace(0, 1, count + 1), np.geomspace(1e-4, 1, FRACTIONS))
 
-    def _rows(self, w: np.ndarray) -> np.ndarray:
-        """Return the response (k, n) from a change of the plant's state to minus the command."""
-        a, c = self._plant.A, self._plant.C
-        states = Transfer(a, np.eye(len(a)), c, np.zeros((len(c), len(a))), self.period).rational_response(w)
-        return -(self.loop.controller.rational_response(w) @ states)[:, 0]
-
     def _respond(self, w: np.ndarray, row: np.ndarray, inputs: np.ndarray) -> np.ndarray:
         """Return L (k, m) with less than a period of delay f, for `inputs` G(T - f) of shape (n, m)."""
         back = np.exp(-1j * w * self.period)[:, None]
@@ -119,7 +113,7 @@ class DelayedLoop:
 
     def _trace(self, w: np.ndarray) -> tuple[_Curve, np.ndarray, float]:
         """Return the curve on a grid, which of its chords may reach -1 with a delay (k - 1,), and the largest |L|."""
-        row = self._rows(w)
+        row = self.loop.respond_to_state(w)
         with np.errstate(all="ignore"):
             size = np.max(np.abs(self._respond(w, row, self._inputs)), axis=1)
             turn = RATE_RESERVE * np.abs(1 - np.exp(-1j * w * self.period))
@@ -133,7 +127,7 @@ class DelayedLoop:
         columns = self._inputs[:, :: max(1, self._inputs.shape[1] // FRACTIONS)]
         for _ in range(MAX_REFINEMENTS):
             with np.errstate(all="ignore"):
-                values = self._respond(w, self._rows(w), columns)
+                values = self._respond(w, self.loop.respond_to_state(w), columns)
                 size = np.maximum(np.abs(values[1:]), np.abs(values[:-1]))
                 change = np.abs(np.diff(values, axis=0)) / np.maximum(1, size)
                 wide = ((change > NEIGHBOUR_DISTANCE) & (size > 0.5)).any(axis=1)

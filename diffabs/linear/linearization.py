@@ -21,7 +21,7 @@ from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import canonical_dtypes
 from diffabs.core.shapes import Float
-from diffabs.core.types import AnyArray, Array, Bool, Scalar
+from diffabs.core.types import AnyArray, Array, Bool, PyTree, Scalar
 from diffabs.parts.plants.wheel import FROZEN_OUTPUTS
 
 T = TypeVar("T")
@@ -46,7 +46,7 @@ class StateSpace(NamedTuple):
 
 
 @default_flags()
-def linearize(plant: Plant, state: object, control: Scalar) -> StateSpace:
+def linearize(plant: Plant, state: object, control: PyTree) -> StateSpace:
     """Return df/dx (n, n) and df/du (n, m) of a plant x' = f(x, u), at a state and a control.
 
     >>> from diffabs import BrakeStart, plants, roads
@@ -58,7 +58,7 @@ def linearize(plant: Plant, state: object, control: Scalar) -> StateSpace:
     Args:
         plant: Plant whose `derivative` is f.
         state: State of the plant; it need not be an equilibrium. The components of x are the leaves of the state.
-        control: Control at this point.
+        control: Control at this point: a number, or the `controls` of a plant with several.
 
     Raises:
         ValueError: A slope of f jumps here, at a kink. Inside jit A and B are then NaN. In single precision a kink is
@@ -167,7 +167,7 @@ def coordinate_moves(by_x: AnyArray, at: AnyArray) -> AnyArray:
     return (jnp.linalg.inv(by_x) * (1 + jnp.abs(at))).T
 
 
-def as_vectors(plant: Plant, state: object, control: Scalar) -> tuple[Callable[[Array, Array], Array], Array, Array]:
+def as_vectors(plant: Plant, state: object, control: PyTree) -> tuple[Callable[[Array, Array], Array], Array, Array]:
     """Return (flow, x, u): f(x, u) as a function of two vectors, the state as vector x, and the control as vector u."""
     plant, state, control = canonical_dtypes((plant, state, control))
     (x, unravel), (u, unravel_control) = ravel_pytree(state), ravel_pytree(control)

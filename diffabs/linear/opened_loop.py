@@ -6,6 +6,8 @@ The loop is at rest on its setpoint: everything stands still, and the plant's fi
 `frozen` outputs (the speed of a brake) holds them, as in `linearization.tracking_dynamics`. Blocks are differentiated
 directly, so a smooth block needs no rule of its own: lags, sensor filters, a gain schedule, an observer.
 
+A plant with several controls makes L a matrix, with a row and a column for each channel.
+
 A `Sampled` controller makes the loop discrete. The other parts are then sampled exactly under a held input, also with a
 delay that is not a whole number of periods. Limits do not act at rest; noise and the motion of the target are
 disturbances.
@@ -21,6 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from diffabs.core.blocks import Direct, Series, offers
+from diffabs.core.channels import control_names, has_channels, outputs_like
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import canonical_dtypes
@@ -45,12 +48,14 @@ class OpenLoop(NamedTuple):
     Attributes:
         plant: System in continuous time from the command to all inputs of the controller.
         controller: System from these inputs to the command.
-        delay: Pure delay [s].
+        delay: Pure delay [s], of each channel.
+        channels: Names of the controls; empty for a plant with one control.
     """
 
     plant: Transfer
     controller: Transfer
     delay: float
+    channels: tuple[str, ...] = ()
 
     @property
     def period(self) -> float | None:
@@ -73,14 +78,18 @@ class OpenLoop(NamedTuple):
             raise ValueError(f"delay = {delay:g} s is outside [0, inf) s")
         _check_halves(self)
         if self.period is None:
-            return _drop_unobserved_states(_series(self.plant, self.controller)._replace(delay=delay))
+            return drop_unobserved_states(in_series(self.plant, self.controller)._replace(delay=delay))
         # Whole periods become shifts in `Transfer`. The rest of the delay is sampled exactly.
-        whole = int(np.floor(delay / self.period + WHOLE_PERIOD_TOLERANCE))
-        remainder = max(delay - whole * self.period, 0.0)
-        plant = sample_plant(
-            self.plant, self.period, remainder if remainder > WHOLE_PERIOD_TOLERANCE * self.period else 0.0
-        )
-        return _drop_unobserved_states(_series(plant, self.controller)._replace(delay=whole * self.period))
+        whole, remainder = split_delay(delay, self.period)
+        plant = sample_plant(self.plant, self.period, remainder)
+        return drop_unobserved_states(in_series(plant, self.controller)._replace(delay=whole * self.period))
+
+    def respond_to_state(self, w: np.ndarray) -> np.ndarray:
+        """Return the response (k, n) from a change of the plant's state to minus the command, if it is sampled."""
+        plant = sample_plant(self.plant, float(self.period or 0.0), 0.0)
+        a, c = plant.A, plant.C
+        states = Transfer(a, np.eye(len(a)), c, np.zeros((len(c), len(a))), self.period).rational_response(w)
+        return -(self.controller.rational_response(w) @ states)[:, 0]
 
 
 def _check_halves(loop: OpenLoop) -> None:
@@ -103,10 +112,12 @@ def open_loop(loop: Loop, target: Scalar | None = None) -> OpenLoop:
     Args:
         loop: Loop to open.
         target: Setpoint in the unit of the first signal; None takes the setpoint of the loop's reference. A reference
-            that searches for its target has no setpoint yet: give the value that it will find.
+            that searches for its target has no setpoint yet: give the value that it will find. A loop with several
+            targets has them in its reference.
 
     Raises:
-        ValueError: A part has a parameter that `check` refuses, or the target is not finite. A block acts at instants
+        ValueError: A part has a parameter that `check` refuses, or the target is not finite, or there are several
+            targets and `target` is not None. A block acts at instants
             (a relay, a controller that computes in every step but is not `Sampled`); or the plant does not come to rest
             at the setpoint; or a slope jumps there, at a kink; or the command does not respond to a measured signal
             there, for example at a limit. In single precision a kink is not noticed.
@@ -126,9 +137,11 @@ def _open(loop: Loop, target: Scalar | None, *, plant: bool) -> OpenLoop:
         raise ValueError(f"target = {float(target):g} is outside (-inf, inf), in the unit of the first signal")
     rational, delay = _split_off_delays(loop)
     _check_continuous(rational)
-    linear = jax.device_get(
-        _linearize_halves(rational, _start_output_and_setpoint(loop)[1] if target is None else float(target))
-    )
+    setpoint = _start_output_and_setpoint(loop)[1]
+    if target is not None and has_channels(setpoint):
+        names = ", ".join(setpoint._fields)
+        raise ValueError(f"target = {float(target):g}: the loop has several targets, {names}: set its reference")
+    linear = jax.device_get(_linearize_halves(rational, setpoint if target is None else float(target)))
     if not linear.residue < MAX_REST_RESIDUE:
         raise ValueError(f"plant {type(loop.plant).__name__} does not come to rest at the setpoint: no linear model")
     halves = (("sensor", "plant", "actuator"), plant and linear.kinked[0]), (("controller",), linear.kinked[1])
@@ -138,7 +151,7 @@ def _open(loop: Loop, target: Scalar | None, *, plant: bool) -> OpenLoop:
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     delay += float(sampled.delay) if sampled else 0.0
     controller = Transfer(*linear.controller)._replace(period=float(sampled.period) if sampled else None)
-    model = OpenLoop(Transfer(*linear.plant), controller, delay)
+    model = OpenLoop(Transfer(*linear.plant), controller, delay, control_names(loop.plant))
     if not len(model.transfer().A):
         raise ValueError(
             f"controller {type(loop.controller).__name__}: its command does not follow what is measured at the "
@@ -161,7 +174,7 @@ def _check_continuous(loop: Loop) -> None:
     start = loop.start()
     signals = {
         "sensor": loop.plant.output(start.plant),
-        "actuator": 0.0 * loop.plant.holding(*_start_output_and_setpoint(loop)),
+        "actuator": jax.tree.map(lambda u: 0.0 * u, loop.plant.holding(*_start_output_and_setpoint(loop))),
     }
     if not isinstance(loop.controller, Sampled):
         signals["controller"] = None
@@ -207,47 +220,48 @@ def _linearize_halves(loop: Loop, setpoint: Scalar) -> _LinearHalves:
     loop, setpoint = canonical_dtypes((loop, setpoint))
     around = _Surroundings(loop, setpoint)
     target = around.chart(around.start)
-    target = target.at[0].set(around.setpoint) if around.frozen else target
+    target = target.at[: len(around.tracked)].set(ravel_pytree(around.setpoint)[0]) if around.frozen else target
     # Newton's method starts on the setpoint, with the other coordinates at their start.
     near = find_root(lambda z: around.chart(z) - target, around.start)
-    guess = loop.plant.holding(around.output(near), around.setpoint)
+    guess = ravel_pytree(loop.plant.holding(around.output(near), around.setpoint))[0]
     free = find_root(around.rest_residual, jnp.append(near, guess))
     residue = jnp.max(jnp.abs(around.rest_residual(free))) / (1 + jnp.max(jnp.abs(free)))
-    z, command = free[:-1], free[-1]
+    z, command = free[: len(near)], free[len(near) :]
     signal, as_signal = ravel_pytree(around.signal(z))
     by_z, b = jax.jacfwd(around.moves, (0, 1))(z, command)
     chart = jax.jacfwd(around.chart)(z)
     # M DF^-1 are the derivatives with respect to the coordinates; the frozen outputs are the last and are cut off.
     n = len(z) - around.held
     a, c = (jnp.linalg.solve(chart.T, m.T).T[:, :n] for m in (by_z, jax.jacfwd(around.signals)(z)))
-    plant = (a[:n], b[:n, None], c, jnp.zeros((len(signal), 1), a.dtype))
+    plant = (a[:n], b[:n], c, jnp.zeros((len(signal), len(command)), a.dtype))
     steps = coordinate_moves(chart, around.chart(z))[:n]
-    bent = is_kinked(
-        lambda z, v: jnp.concatenate([around.moves(z, v[0])[:n], around.signals(z)]), steps, z, command[None]
-    )
+    bent = is_kinked(lambda z, v: jnp.concatenate([around.moves(z, v)[:n], around.signals(z)]), steps, z, command)
     controller, compute, inside = _linearize_controller(loop, signal, as_signal, command)
     moves = jax.vmap(lambda step: jax.jvp(around.signals, (z,), (step,))[1])(steps)
     return _LinearHalves(plant, controller, residue, (bent, is_kinked(compute, moves, signal, inside)))
 
 
 class _Surroundings:
-    """Plant, sensor and actuator of a loop as functions of one vector z.
+    """Plant, sensor and actuator of a loop as functions of one vector z, and of the commands v as a vector.
 
-    The coordinates begin with the tracked signal, and the states on which neither it nor the frozen outputs depend.
+    The coordinates begin with the tracked signals, and the states on which neither they nor the frozen outputs depend.
     Then follow the states of sensor and actuator, and the `held` frozen outputs.
     """
 
-    def __init__(self, loop: Loop, setpoint: Scalar):
+    def __init__(self, loop: Loop, setpoint: PyTree):
         state = loop.start()
         parts = _SurroundingStates(state.plant, state.sensor.flow, state.actuator.flow)
         self.loop, self.setpoint = loop, setpoint
         self.memory = (state.sensor.held, state.actuator.held)
         self.start, self.unravel = ravel_pytree(parts)
         self.frozen: Any = tuple(getattr(loop.plant, "frozen", ()))
-        first = loop.plant.shows._fields[0]
+        self.tracked = setpoint._fields if has_channels(setpoint) else loop.plant.shows._fields[:1]
+        self.as_control = ravel_pytree(loop.plant.holding(self.output(self.start), setpoint))[1]
         size = ravel_pytree(state.plant)[0].size
         remaining = (
-            independent_components(loop.plant, state.plant, (first, *self.frozen)) if self.frozen else np.arange(size)
+            independent_components(loop.plant, state.plant, (*self.tracked, *self.frozen))
+            if self.frozen
+            else np.arange(size)
         )
         self.remaining, self.size, self.held = remaining, size, len(self.frozen)
 
@@ -261,8 +275,8 @@ class _Surroundings:
     def signals(self, z: Array) -> Array:
         return ravel_pytree(self.signal(z))[0]
 
-    def flow(self, z: Array, command: Scalar) -> Array:
-        x = self.unravel(z)
+    def flow(self, z: Array, v: Array) -> Array:
+        x, command = self.unravel(z), self.as_control(v)
         actuator = Memory(x.actuator, self.memory[1])
         control = self.loop.actuator.output(0.0, actuator, command)
         rates = _SurroundingStates(
@@ -277,26 +291,27 @@ class _Surroundings:
         if not self.frozen:
             return z
         y = self.output(z)
-        last = jnp.stack([getattr(y, name) for name in self.frozen])
-        return jnp.concatenate([y[0][None], z[self.remaining], z[self.size :], last])
+        first, last = (jnp.stack([getattr(y, name) for name in names]) for names in (self.tracked, self.frozen))
+        return jnp.concatenate([first, z[self.remaining], z[self.size :], last])
 
-    def moves(self, z: Array, command: Scalar) -> Array:
-        return jax.jvp(self.chart, (z,), (self.flow(z, command),))[1]
+    def moves(self, z: Array, v: Array) -> Array:
+        return jax.jvp(self.chart, (z,), (self.flow(z, v),))[1]
 
     def rest_residual(self, free: PyTree) -> Array:
         """Return a vector that is zero at rest.
 
         It contains the rates of all coordinates except the frozen outputs, and the change of the frozen outputs since
-        the start. The last entry is the first signal minus the setpoint.
+        the start. The last entries are the tracked signals minus their setpoints.
         """
-        z, command = free[:-1], free[-1]
-        rates = self.moves(z, command)[: len(z) - self.held]
+        n = len(self.start)
+        z, v = free[:n], free[n:]
+        rates = self.moves(z, v)[: len(z) - self.held]
         where = self.chart(z)[len(z) - self.held :] - self.chart(self.start)[len(z) - self.held :]
-        return jnp.concatenate([rates, where, (self.output(z)[0] - self.setpoint)[None]])
+        return jnp.concatenate([rates, where, tracking_errors(self.output(z), self.setpoint)])
 
 
 def _linearize_controller(
-    loop: Loop, signal: Array, as_signal: Callable[[Array], Tracking], command: Scalar
+    loop: Loop, signal: Array, as_signal: Callable[[Array], Tracking], command: Array
 ) -> tuple[tuple[Array, Array, Array, Array], Callable[[Array, Array], Array], Array]:
     """Return the controller at rest with the command that holds the plant: (A, B, C, D), a function, and its memory.
 
@@ -305,16 +320,17 @@ def _linearize_controller(
     controller, memory = loop.controller, loop.start().controller
     sampled = isinstance(controller, Sampled)
     inside, unravel = ravel_pytree(memory.held.inner if sampled else memory)
+    targets = len(jax.tree.leaves(as_signal(signal).target))
 
-    def compute(c: Array, s: Array) -> tuple[PyTree, PyTree]:
+    def compute(c: Array, s: Array) -> tuple[PyTree, Array]:
         """Return the memory after a sample, or its rate in continuous time; and the command."""
         memory, tracking = unravel(c), as_signal(s)
         if not isinstance(controller, Sampled):
             rate = controller.flow(0.0, memory, tracking)
-            return ravel_pytree(memory._replace(flow=rate))[0], controller.output(0.0, memory, tracking)
+            return ravel_pytree(memory._replace(flow=rate))[0], _flatten(controller.output(0.0, memory, tracking))
         clock = Clock(0.0, controller.period, 1, None, before=tracking)
         after, output = controller.compute_sample(clock, memory, tracking)
-        return ravel_pytree(after)[0], output
+        return ravel_pytree(after)[0], _flatten(output)
 
     def rest_residual(c: Array, s: Array = signal) -> Array:
         """Return a vector that is zero where the memory is at rest and the command holds the plant."""
@@ -325,8 +341,8 @@ def _linearize_controller(
         """Return the memory at rest and the size of the residual; `offset` moves the target for the first step."""
         # At the setpoint itself the command may be at the edge of a limit, where its slope is zero. The first step
         # therefore uses the slopes at a nearby target.
-        size = jnp.where(signal[0] == 0, 1.0, jnp.abs(signal[0]))
-        slopes = jax.jacfwd(rest_residual)(inside, signal.at[0].add(offset * size))
+        size = jnp.where(signal[:targets] == 0, 1.0, jnp.abs(signal[:targets]))
+        slopes = jax.jacfwd(rest_residual)(inside, signal.at[:targets].add(offset * size))
         c = find_root(rest_residual, inside - jnp.linalg.pinv(slopes) @ rest_residual(inside))
         return c, jnp.sum(jnp.abs(rest_residual(c)))
 
@@ -335,10 +351,19 @@ def _linearize_controller(
         # The offset with the smallest finite residual.
         inside = candidates[jnp.argmin(jnp.where(jnp.isfinite(residuals), residuals, jnp.inf))]
     (f, g), (h, j) = jax.jacfwd(compute, (0, 1))(inside, signal)
-    return (f, g, h[None], j[None]), lambda s, c: jnp.append(*compute(c, s)), inside
+    return (f, g, h, j), lambda s, c: jnp.append(*compute(c, s)), inside
 
 
-def _series(first: Transfer, second: Transfer) -> Transfer:
+def tracking_errors(output: PyTree, setpoint: PyTree) -> Array:
+    """Return the tracked outputs minus their setpoints, as a vector."""
+    return _flatten(outputs_like(output, setpoint)) - _flatten(setpoint)
+
+
+def _flatten(signal: PyTree) -> Array:
+    return ravel_pytree(signal)[0]
+
+
+def in_series(first: Transfer, second: Transfer) -> Transfer:
     """Return minus the second system behind the first (negative feedback); the first has no direct path."""
     n, m = len(first.A), len(second.A)
     a = np.block([[first.A, np.zeros((n, m))], [second.B @ first.C, second.A]])
@@ -362,7 +387,15 @@ def sample_plant(plant: Transfer, period: float, delay: float) -> Transfer:
     return Transfer(a, b, np.hstack([plant.C, np.zeros((len(plant.C), m))]), plant.D, period)
 
 
-def _drop_unobserved_states(system: Transfer) -> Transfer:
+def split_delay(delay: float, period: float) -> tuple[int, float]:
+    """Return a delay [s] as whole periods, and the rest [s]; a rest of a rounding is 0."""
+    whole = int(np.floor(delay / period + WHOLE_PERIOD_TOLERANCE))
+    rest = max(delay - whole * period, 0.0)
+    return whole, rest if rest > WHOLE_PERIOD_TOLERANCE * period else 0.0
+
+
+def drop_unobserved_states(system: Transfer) -> Transfer:
+    """Return a system without the states that do not influence its output."""
     observed = (system.C != 0).any(axis=0)
     # Each pass adds the states that influence an observed one; as many passes as states reach all of them.
     for _ in observed:

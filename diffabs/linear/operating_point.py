@@ -1,8 +1,8 @@
 """The linear model of a control loop at rest on its setpoint, by automatic differentiation.
 
-    x' = A x + B u,   u = K x      x: states of the plant and the blocks, u: the controller's command
+    x' = A x + B u,   u = K x      x: states of the plant and the blocks, u: the controller's commands
 
-At rest the plant stands still and its first signal is the setpoint: f(x, u) = 0, y1(x) = setpoint. Newton's method
+At rest the plant stands still and its tracked signals are the setpoints: f(x, u) = 0, y(x) = setpoint. Newton's method
 finds this point from the loop's start. The command is differentiated there too, so A + B K is the loop's own
 linearisation for any controller that is smooth there. The target is held at the setpoint; its motion is a disturbance.
 States on which neither the plant nor the command depends are left out. An example is the integral state of a
@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from diffabs.core.channels import control_names, outputs_like, zero_controls
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import canonical_dtypes, pytree, static
 from diffabs.core.types import AnyArray, Array, Bool, Matrix, Part, PyTree, Scalar
 from diffabs.linear.linearization import StateSpace, check_kink, is_kinked, nan_at_kink
-from diffabs.loop.closed_loop import Loop, LoopParts
+from diffabs.loop.closed_loop import Loop, LoopParts, LoopState
 from diffabs.parts.stops import NoStop
 
 ROOT_ITERATIONS = 10  # Gauss-Newton iterations to the point of rest; one is enough where the loop is linear
@@ -35,8 +36,8 @@ class LinearLoop(NamedTuple):
 
     Attributes:
         A: State matrix, shape (n, n).
-        B: Input matrix, shape (n, 1).
-        K: Gain of the loop's controller, shape (n,).
+        B: Input matrix, shape (n, m).
+        K: Gain of the loop's controller, shape (m, n).
         residue: Largest rate or error at the operating point, over 1 plus the largest state or command.
         kinked: Whether a slope jumps at the operating point; A, B and K are then NaN.
     """
@@ -70,7 +71,7 @@ class OperatingPoint(LoopParts):
         return tuple(names[i] for i in self.indices)
 
     def matrices(self) -> StateSpace:
-        """Return A (n, n) and B (n, 1), differentiable in every parameter; they compile once for each kind of loop.
+        """Return A (n, n) and B (n, m), differentiable in every parameter; they compile once for each kind of loop.
 
         At a kink, where a slope jumps, this raises ValueError. Inside jit A and B are NaN there.
         """
@@ -78,8 +79,11 @@ class OperatingPoint(LoopParts):
         return StateSpace(model.A[indices][:, indices], model.B[indices])
 
     def gain(self) -> AnyArray:
-        """Return K (n,) of the loop's own controller; at a kink ValueError, inside jit NaN."""
-        return _smooth_model(self).K[np.array(self.indices, int)]
+        """Return K of the loop's own controller, (m, n), or (n,) for a plant with a single control.
+
+        At a kink this raises ValueError; inside jit K is NaN there.
+        """
+        return _gain_on(_smooth_model(self), self, np.array(self.indices, int))
 
 
 @default_flags()
@@ -106,19 +110,25 @@ def operating_point(loop: Loop) -> OperatingPoint:
     # The plant's states come first in the vector of states.
     plant = np.arange(len(linear.A)) < len(ravel_pytree(start.plant)[0])
     # The model contains these, those on which the command depends, and all that influence one of them.
-    contained = plant | (linear.K != 0)
+    contained = plant | (linear.K != 0).any(axis=0)
     for _ in contained:
         contained = contained | (linear.A[contained] != 0).any(axis=0)
     return dataclasses.replace(model, indices=tuple(np.flatnonzero(contained).tolist()))  # pyright: ignore[reportArgumentType]
 
 
 def loop_gain(loop: Loop, states: tuple[str, ...]) -> AnyArray:
-    """Return K (n,) of a loop's controller on the named states, differentiable in the loop's parameters.
+    """Return K of a loop's controller on the named states, differentiable in the loop's parameters.
+
+    It has the shape (m, n), or (n,) for a plant with a single control.
 
     At a kink this raises ValueError; inside jit K is NaN there.
     """
-    names = _names(loop)
-    return _smooth_model(_drop_stop(loop)).K[np.array([names.index(name) for name in states])]
+    names, model = _names(loop), _drop_stop(loop)
+    return _gain_on(_smooth_model(model), model, np.array([names.index(name) for name in states]))
+
+
+def _gain_on(linear: LinearLoop, model: OperatingPoint, indices: np.ndarray) -> AnyArray:
+    return linear.K[:, indices] if control_names(model.plant) else linear.K[0, indices]
 
 
 def _drop_stop(loop: Loop) -> OperatingPoint:
@@ -150,31 +160,41 @@ def _names(loop: Loop) -> list[str]:
 
 
 class _VectorLoop(NamedTuple):
-    """A loop held at its setpoint, with all integrated states in one vector z and the command v as the actuator's
+    """A loop held at its setpoint, with all integrated states in one vector z and the commands v as the actuator's
     input.
     """
 
     loop: Loop
-    setpoint: Scalar
+    setpoint: PyTree
     unravel: Callable[[Array], PyTree]
+    as_control: Callable[[Array], PyTree]
+    held: LoopState
 
     def track(self, z: Array) -> tuple[PyTree, Tracking]:
         loop, x = self.loop, self.unravel(z)
         y = loop.plant.output(x.plant)
-        measured = loop.sensor.output(0.0, Memory(x.sensor), y)
+        measured = loop.sensor.output(0.0, self.memory("sensor", x), y)
         return y, Tracking(self.setpoint, measured, loop.feedforward.input(loop.plant, measured, self.setpoint))
 
-    def command(self, z: Array) -> AnyArray:
-        return self.loop.controller.output(0.0, Memory(self.unravel(z).controller), self.track(z)[1])
+    def memory(self, name: str, x: "_IntegratedStates") -> Memory:
+        return getattr(self.held, name)._replace(flow=getattr(x, name))
 
-    def flow(self, z: Array, v: Scalar) -> AnyArray:
-        loop, x = self.loop, self.unravel(z)
-        y, signal = self.track(z)
+    def command(self, z: Array) -> Array:
+        x = self.unravel(z)
+        return ravel_pytree(self.loop.controller.output(0.0, self.memory("controller", x), self.track(z)[1]))[0]
+
+    def tracking_errors(self, z: Array) -> Array:
+        setpoint = self.setpoint
+        return ravel_pytree(outputs_like(self.track(z)[0], setpoint))[0] - ravel_pytree(setpoint)[0]
+
+    def flow(self, z: Array, v: Array) -> AnyArray:
+        loop, x, command = self.loop, self.unravel(z), self.as_control(v)
+        (y, signal), actuator = self.track(z), self.memory("actuator", x)
         rates = _IntegratedStates(
-            loop.plant.derivative(0.0, x.plant, loop.actuator.output(0.0, Memory(x.actuator), v)),
-            loop.sensor.flow(0.0, Memory(x.sensor), y),
-            loop.controller.flow(0.0, Memory(x.controller), signal),
-            loop.actuator.flow(0.0, Memory(x.actuator), v),
+            loop.plant.derivative(0.0, x.plant, loop.actuator.output(0.0, actuator, command)),
+            loop.sensor.flow(0.0, self.memory("sensor", x), y),
+            loop.controller.flow(0.0, self.memory("controller", x), signal),
+            loop.actuator.flow(0.0, actuator, command),
         )
         return ravel_pytree(rates)[0]
 
@@ -182,32 +202,36 @@ class _VectorLoop(NamedTuple):
 @jax.jit
 def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     loop = canonical_dtypes(model).loop
-    setpoint = loop.reference.setpoint(loop.start().reference)
+    start = loop.start()
+    setpoint = loop.reference.setpoint(start.reference)
     z, unravel = ravel_pytree(_start(loop))
-    vectors = _VectorLoop(loop, setpoint, unravel)
+    no_control, as_control = ravel_pytree(zero_controls(loop.plant, jax.tree.leaves(setpoint)[0]))
+    vectors = _VectorLoop(loop, setpoint, unravel, as_control, start)
     at = _IntegratedStates(*(np.size(ravel_pytree(part)[0]) for part in _start(loop)))
     inside = np.repeat(np.arange(4) == _IntegratedStates._fields.index("controller"), at)
 
-    def still(free: PyTree) -> Matrix:
-        """Return the rates of everything but the controller, and the first signal minus the setpoint; zero at rest."""
-        moved = z.at[~inside].set(free[:-1])
-        return jnp.append(vectors.flow(moved, free[-1])[~inside], vectors.track(moved)[0][0] - setpoint)
+    outside = int(np.sum(~inside))
 
-    # First the states outside the controller, together with the command that holds the plant; then the controller.
-    free = find_root(still, jnp.append(z[~inside], 0.0))
-    z = z.at[~inside].set(free[:-1])
+    def still(free: PyTree) -> Matrix:
+        """Return the rates of everything but the controller, and the errors of the tracked signals; zero at rest."""
+        moved = z.at[~inside].set(free[:outside])
+        return jnp.append(vectors.flow(moved, free[outside:])[~inside], vectors.tracking_errors(moved))
+
+    # First the states outside the controller, together with the commands that hold the plant; then the controller.
+    free = find_root(still, jnp.append(z[~inside], no_control))
+    z, v = z.at[~inside].set(free[:outside]), free[outside:]
 
     def rest_residual(memory: object, z: Array = z) -> Matrix:
-        """Return the rates of the controller's memory, and its command minus that which holds the plant."""
+        """Return the rates of the controller's memory, and its commands minus those that hold the plant."""
         moved = z.at[inside].set(memory)
-        return jnp.append(vectors.flow(moved, free[-1])[inside], vectors.command(moved) - free[-1])
+        return jnp.append(vectors.flow(moved, v)[inside], vectors.command(moved) - v)
 
     z = z.at[inside].set(find_root(rest_residual, z[inside]))
-    a, b = jax.jacfwd(vectors.flow, (0, 1))(z, free[-1])
+    a, b = jax.jacfwd(vectors.flow, (0, 1))(z, v)
     residue = jnp.max(jnp.abs(still(free))) / (1 + jnp.max(jnp.abs(free)))
-    moves, v = jnp.diag(1 + jnp.abs(z)), free[-1][None]
-    kinked = is_kinked(lambda z, v: jnp.append(vectors.flow(z, v[0]), vectors.command(z)), moves, z, v)
-    a, b, k = nan_at_kink((a, b[:, None], jax.jacfwd(vectors.command)(z)), kinked)
+    moves = jnp.diag(1 + jnp.abs(z))
+    kinked = is_kinked(lambda z, v: jnp.append(vectors.flow(z, v), vectors.command(z)), moves, z, v)
+    a, b, k = nan_at_kink((a, b, jax.jacfwd(vectors.command)(z)), kinked)
     return LinearLoop(a, b, k, residue, kinked)
 
 

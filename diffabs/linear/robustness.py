@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.channels import need_single_control
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.pytree import replace
 from diffabs.core.shapes import Float
@@ -98,6 +99,7 @@ def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, tar
         ValueError: A range is inverted, there are more than 10 ranges, or the loop has no linear model at a point.
         KeyError: A path does not exist.
     """
+    need_single_control(loop.plant, "a band of margins")
     free = {path: (float(low), float(high)) for path, (low, high) in over.items()}
     for path, (low, high) in free.items():
         if not low <= high:

@@ -23,6 +23,7 @@ from jax.typing import ArrayLike
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.shapes import Bool, Float
 from diffabs.core.types import Any, JsonObject
+from diffabs.linear.channel_loop import ChannelLoop, select_loop
 from diffabs.linear.delay_steps import LEAST_DISTANCE, REACHING, DelayedLoop
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.transfer import Transfer, check_transfer
@@ -104,10 +105,11 @@ class Margins(NamedTuple):
 
     def record(self) -> JsonObject:
         """Return `stable` and the `numbers` as JSON values; infinity (no limit) is the text "inf", and NaN is None."""
-        return {"stable": self.stable, **{name: _json_number(value) for name, value in self.numbers().items()}}
+        return {"stable": self.stable, **{name: json_number(value) for name, value in self.numbers().items()}}
 
 
-def _json_number(value: float) -> float | str | None:
+def json_number(value: float) -> float | str | None:
+    """Return a margin as a JSON value: infinity is the text "inf", and NaN is None."""
     return "inf" if value == math.inf else None if math.isnan(value) else float(value)
 
 
@@ -131,8 +133,8 @@ class Crossovers(NamedTuple):
 
 
 @default_flags()
-def margins(loop: OpenLoop | Transfer) -> Margins:
-    """Return the margins of an open loop.
+def margins(loop: OpenLoop | Transfer, channel: str | None = None) -> Margins:
+    """Return the margins of an open loop, or of one channel of a loop with several, with the others closed.
 
     In continuous time the delay margin is the smallest (phase lag to -1)/frequency over all crossovers. For a sampled
     `Transfer` only whole periods have a meaning: it is the fewest periods that make the loop unstable. An `OpenLoop`
@@ -145,13 +147,16 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
     delays (|L| < 0.99 for an `OpenLoop`, as a peak may be between points).
 
     Args:
-        loop: Open loop with one input and one output.
+        loop: Open loop with one input and one output, or the `OpenLoop` of a plant with several controls.
+        channel: Name of the control whose channel is open.
 
     Raises:
-        ValueError: The loop is no open loop, has several inputs or outputs, or has a field that `check_transfer`
-            refuses.
+        ValueError: The loop is no open loop, or has a field that `check_transfer` refuses. It has several inputs or
+            outputs and no channel is named, or no channel has this name. Or it has several channels and a delay in
+            continuous time.
 
     See also:
+        `linear.multivariable_margins`: Margins of all channels together.
         `linear.Transfer`: A linear system with a delay, as an argument.
         `linear.open_loop`: The loop of a plant and a controller, opened at the control.
         `linear.linearize`: Its linear model.
@@ -185,11 +190,17 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
         raise ValueError(
             f"loop = {type(loop).__name__} is no OpenLoop or Transfer: open_loop(loop) makes one of a Loop"
         )
-    loop = check_transfer(loop) if isinstance(loop, Transfer) else loop
-    system = check_transfer(loop.transfer()) if isinstance(loop, OpenLoop) else loop
+    if channel is not None:
+        return _find_margins(select_loop(loop, channel))
+    return _find_margins(check_transfer(loop) if isinstance(loop, Transfer) else loop)
+
+
+def _find_margins(loop: OpenLoop | ChannelLoop | Transfer) -> Margins:
+    system = loop if isinstance(loop, Transfer) else check_transfer(loop.transfer())
     if np.shape(system.D) != (1, 1):
-        outputs, inputs = np.shape(system.D)
-        raise ValueError(f"margins are of one input and one output; the system has {inputs} and {outputs}")
+        (outputs, inputs), names = np.shape(system.D), " or ".join(getattr(loop, "channels", ()))
+        hint = f"; name a channel: {names}" if names else ""
+        raise ValueError(f"margins are of one input and one output; the system has {inputs} and {outputs}{hint}")
     w = frequency_grid(system)
     crossovers = find_crossovers(system, w)
     crossover = float(crossovers.unit_at.max()) if len(crossovers.unit_at) else math.nan
@@ -245,7 +256,7 @@ def _add_touches(system: Transfer, w: np.ndarray, crossovers: Crossovers) -> Cro
     touches = []
     for i in lowest:
         around = slice(max(i - 1, 0), i + 2)
-        gap, at = (0.0, w[i]) if values[i] == 0 else _peak(lambda w: -distance(w), w[around])
+        gap, at = (0.0, w[i]) if values[i] == 0 else find_peak(lambda w: -distance(w), w[around])
         if gap == 0 and len(set(signs[around] > 0)) == 1:
             touches.append(at)
     unit_at = np.array(touches)
@@ -299,9 +310,14 @@ def closed_loop_poles(system: Transfer) -> np.ndarray:
     """Return the poles (order,) of the closed loop: in z if it is sampled, else in s.
 
     A delay in continuous time is left out, because it makes infinitely many poles. If 1 + D = 0 the closed loop is not
-    well-posed, and the poles are NaN.
+    well-posed, and the poles are NaN. With several channels D is a matrix, and I + D is singular.
     """
     system = system._replace(delay=0.0) if system.period is None else system.without_delay()
+    if len(system.D) > 1:
+        direct = np.eye(len(system.D)) + system.D
+        if np.linalg.matrix_rank(direct) < len(direct):
+            return np.full(len(system.A), math.nan)
+        return np.linalg.eigvals(system.A - system.B @ np.linalg.solve(direct, system.C))
     if not 1 + system.D[0, 0]:
         return np.full(len(system.A), math.nan)
     return np.linalg.eigvals(system.A - system.B @ system.C / (1 + system.D[0, 0]))
@@ -433,7 +449,7 @@ def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple
     return 0.5 * (low + high), before > 0
 
 
-def _peak(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple[float, float]:
+def find_peak(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple[float, float]:
     """Return the maximum of a function and its place, by golden-section search around the maximum on a grid."""
     with np.errstate(all="ignore"):
         i = int(np.nanargmax(function(w)))
@@ -455,7 +471,7 @@ def _sensitivities(system: Transfer, w: np.ndarray) -> tuple[tuple[float, float]
         lambda w: 1 / np.abs(1 + _response(system, w)),
         lambda w: np.abs(_complementary_sensitivity(_response(system, w))),
     )
-    peaks = [_peak(function, w) for function in sensitivities]
+    peaks = [find_peak(function, w) for function in sensitivities]
     if system.period is None:
         far = _limit_at_infinity(system)
         ends = (1 / abs(1 + far), abs(far / (1 + far)))
@@ -496,7 +512,9 @@ def _gain_margins(crossovers: Crossovers) -> tuple[tuple[float, float], tuple[fl
     return (low, high), (low_at, high_at)
 
 
-def _delay_margin(loop: OpenLoop | Transfer, system: Transfer, w: np.ndarray, crossovers: Crossovers) -> float:
+def _delay_margin(
+    loop: OpenLoop | ChannelLoop | Transfer, system: Transfer, w: np.ndarray, crossovers: Crossovers
+) -> float:
     """Return the delay margin of a stable loop [s]; `system` is its transfer function on the grid `w`."""
     if _is_unstable_with_any_delay(system):
         return 0.0
@@ -505,7 +523,7 @@ def _delay_margin(loop: OpenLoop | Transfer, system: Transfer, w: np.ndarray, cr
     if loop.period is None:
         return guess
     end = max(MAX_DELAY_PERIODS * loop.period, MAX_DELAY_MULTIPLE * guess if len(delays) else 0.0)
-    return _find_margin(loop, w, end) if isinstance(loop, OpenLoop) else _count_margin(loop, len(delays) > 0, end)
+    return _count_margin(loop, len(delays) > 0, end) if isinstance(loop, Transfer) else _find_margin(loop, w, end)
 
 
 def _count_margin(loop: Transfer, crosses: bool, end: float) -> float:
@@ -532,7 +550,7 @@ def _count_margin(loop: Transfer, crosses: bool, end: float) -> float:
     return float(added[unstable[0]]) if len(unstable) else math.nan
 
 
-def _find_margin(loop: OpenLoop, w: np.ndarray, end: float) -> float:
+def _find_margin(loop: OpenLoop | ChannelLoop, w: np.ndarray, end: float) -> float:
     """Return the smallest added delay that makes a stable loop with a sampled controller unstable [s].
 
     It is infinity if |L| < 0.99 with every delay. It is NaN if no delay up to `end` suffices, or the steps run out.
@@ -552,7 +570,7 @@ def _find_margin(loop: OpenLoop, w: np.ndarray, end: float) -> float:
     return math.nan
 
 
-def _bisect_delay(loop: OpenLoop, low: float, high: float) -> float:
+def _bisect_delay(loop: OpenLoop | ChannelLoop, low: float, high: float) -> float:
     """Return the added delay between a stable and an unstable one at which the loop turns unstable [s]."""
     while high - low > 1e-12 * high:
         middle = 0.5 * (low + high)

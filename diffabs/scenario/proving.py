@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from diffabs.core.channels import need_single_control
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
 from diffabs.host.separated import read_decimal
@@ -60,6 +61,7 @@ def build_proof_task(
         ValueError: The loop has no linear model.
         ModuleNotFoundError: No SDP solver is installed.
     """
+    need_single_control(scenario.loop.plant, "design" if weighed else "certify")
     if weighed and scenario.design.Q is None:
         raise ScenarioError("design.Q and design.R are missing: a design minimises the cost that they weigh")
     from diffabs.robust.design import Spec

@@ -3,8 +3,11 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from diffabs.core.channels import control_names, need_single_control
 from diffabs.core.pytree import replace
 from diffabs.core.types import JsonObject
+from diffabs.linear.multivariable_margins import MULTIVARIABLE_UNITS, MultivariableMargins, multivariable_margins
+from diffabs.linear.opened_loop import OpenLoop, open_loop
 from diffabs.linear.robustness import Band, System, band
 from diffabs.linear.stability_margins import MARGIN_UNITS
 from diffabs.scenario.scenario import Scenario
@@ -42,10 +45,37 @@ class ScenarioMargins(NamedTuple):
         }
 
 
+class ScenarioChannelMargins(NamedTuple):
+    """The margins of a scenario whose plant has several controls.
+
+    Attributes:
+        values: Fixed values by path of the loop, in SI.
+        loop: The open loop at these values.
+        margins: Margins of each channel and of all.
+    """
+
+    values: Mapping[str, float]
+    loop: OpenLoop
+    margins: MultivariableMargins
+
+    def record(self) -> JsonObject:
+        """Return the margins as JSON values, in SI."""
+        return {
+            "at": dict(self.values),
+            "period": self.loop.period,
+            "delay_in_the_loop": self.loop.delay,
+            "order": len(self.loop.transfer().A),
+            **self.margins.record(),
+            "units": MARGIN_UNITS | MULTIVARIABLE_UNITS,
+        }
+
+
 def examine_margins(
     scenario: Scenario, values: Mapping[str, float] | None = None, target: float | None = None, samples: int = 32
-) -> ScenarioMargins:
+) -> ScenarioMargins | ScenarioChannelMargins:
     """Return the margins of a scenario's loop, at its values and over the ranges of [design.over].
+
+    A plant with several controls has margins at its values only.
 
     Args:
         values: Values by path of the loop, in SI, which replace the loop's own and their ranges.
@@ -53,10 +83,15 @@ def examine_margins(
         samples: Number of systems inside the ranges, added to the corners.
 
     Raises:
-        ValueError: The loop has no linear model at a point.
+        ValueError: The loop has no linear model at a point, or several controls and [design.over].
     """
     values = dict(values or {})
     loop = replace(scenario.loop, values)
+    if control_names(loop.plant):
+        if scenario.design.over:
+            need_single_control(loop.plant, "margins over [design.over]")
+        opened = open_loop(loop, target)
+        return ScenarioChannelMargins(values, opened, multivariable_margins(opened))
     over = {path: ends for path, ends in scenario.design.ranges(scenario.loop).items() if path not in values}
     (nominal,) = band(loop, {}, 0, target).systems
     return ScenarioMargins(values, target, over, nominal, band(loop, over, samples, target) if over else Band((), 0))

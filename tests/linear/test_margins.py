@@ -470,7 +470,7 @@ def test_closed_is_the_loop_of_the_certificates(name):
     np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-9)
 
 
-@killed_by("linear.opened_loop", "target.at[0].set(around.setpoint) if around.frozen else target", "target")
+@killed_by("linear.opened_loop", "setpoint)[0]) if around.frozen else target", "setpoint)[0]) if False else target")
 @pytest.mark.slow
 def test_the_brake_lab_rig_and_a_filtered_sensor_come_to_rest():
     lab = rig(plant=LabRig(), initial=BrakeStart(speed=14.0), controller=StateFeedback(gain=(-60.0, -4.0)))
@@ -500,7 +500,7 @@ def test_a_pure_delay_turns_the_phase_and_nothing_else():
     assert other.delay == pytest.approx(one.delay - 1e-3, rel=1e-9)
 
 
-@killed_by("linear.opened_loop", "remainder = max(delay - whole * self.period, 0.0)", "remainder = 0.0")
+@killed_by("linear.opened_loop", "rest = max(delay - whole * period, 0.0)", "rest = 0.0")
 @pytest.mark.slow
 def test_a_sampled_loop_with_delay_fits_its_step_response():
     """2.6 periods of delay: the pulse response of L(z) is that of the continuous plant, which has one state."""

@@ -128,6 +128,7 @@ def feedback_gain(loop: Loop, states: Sequence[str]) -> AnyArray:
 
     K of a `ProportionalFeedback` holds at its reference speed. A `BalanceFeedback` has K whole, whatever the names.
     """
+    need_single_control(loop.plant, "a constraint on poles or decay")
     controller = inner_controller(loop.controller)
     if isinstance(controller, BalanceFeedback):
         return jnp.asarray(controller.gain, float)

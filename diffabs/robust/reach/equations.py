@@ -30,6 +30,7 @@ from jax.typing import DTypeLike
 from diffabs.compiler.ir import Graph, Node, NodeArray, UpdateLevel, live_nodes
 from diffabs.compiler.lower.rules import Unsupported, constant_array, lower_jaxpr, scalar_array
 from diffabs.core.blocks import offers
+from diffabs.core.channels import need_single_control
 from diffabs.core.messages import Clock
 from diffabs.core.protocols import BrakeOutput
 from diffabs.core.pytree import parameters, replace
@@ -245,6 +246,10 @@ def derive_equations(loop: Loop, over: Iterable[str]) -> Equations:
     """
     paths = tuple(over)
     check_part(loop)
+    try:
+        need_single_control(loop.plant, "a proof over a box")
+    except ValueError as error:
+        raise NoRule(str(error)) from None
     try:
         with jax.enable_x64(True):
             return _Derivation(loop, paths).equations()
