@@ -39,13 +39,13 @@ def show_margins(result: JsonObject, scenario: Scenario, margins: ScenarioMargin
 
 def show_channel_margins(result: JsonObject, scenario: Scenario, margins: ScenarioChannelMargins) -> None:
     """Show a table with a row for each channel, and one for all channels together at inputs and outputs."""
-    found = margins.margins
+    all_margins = margins.margins
     table = Table("channel", *SHORT_NAMES.values())
-    for channel, one in found.channels.items():
-        table.add_row(channel, *(_format_margin(name, one) for name in SHORT_NAMES))
+    for channel, single in all_margins.channels.items():
+        table.add_row(channel, *(_format_margin(name, single) for name in SHORT_NAMES))
     tables.show_titled_table(f"{_title(result, scenario)}; a channel with the others closed", table)
     table = Table("all channels", "least s(I + L)", "at [rad/s]", "Mt", "disk margin", "gains up", "phases [deg]")
-    for place, at in (("at the controls", found.input), ("at the outputs", found.output)):
+    for place, at in (("at the controls", all_margins.input), ("at the outputs", all_margins.output)):
         if at:
             values = (at.smallest, at.sensitivity_at, at.complementary, at.disk, at.gain[1], math.degrees(at.phase))
             table.add_row(place, *map(_format_number, values))

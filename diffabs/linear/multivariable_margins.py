@@ -109,7 +109,7 @@ class MultivariableMargins(NamedTuple):
         """Return the margins as JSON values."""
         return {
             "stable": self.stable,
-            "channels": {name: found.record() for name, found in self.channels.items()},
+            "channels": {name: single.record() for name, single in self.channels.items()},
             "input": self.input.record(),
             "output": self.output.record() if self.output else None,
         }

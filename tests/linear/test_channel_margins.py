@@ -109,7 +109,6 @@ def test_poles_and_open_channels_are_those_of_python_control(name):
         assert ours.modulus >= np.min(np.abs(1 + response)) * 0.99
 
 
-@killed_by("linear.channel_loop", "delays = np.full(len(self.whole.channels), self.delay)", "delays = np.zeros(2)")
 @pytest.mark.parametrize("name", ["continuous", "sampled", "sampled late"])
 def test_channels_that_do_not_meet_have_the_margins_of_their_scalar_loops(name):
     parts = {"continuous": {}, "sampled": {"controller": sampled()}, "sampled late": {"controller": sampled(0.3)}}[name]
@@ -181,7 +180,7 @@ def step_matrix(opened, delays):
     return np.stack([step(unit) for unit in np.eye(size)], axis=1)
 
 
-@killed_by("linear.channel_loop", "respond_to_state", "respond_to_other")
+@killed_by("linear.channel_loop", "delays = np.full(len(self.whole.channels), self.delay)", "delays = np.zeros(2)")
 def test_the_delay_margin_of_a_sampled_channel_is_where_the_loop_turns_unstable():
     opened = open_loop(tank(controller=sampled(0.2, pump_1=(600.0, 20.0))))
     for i, channel in enumerate(CHANNELS):
@@ -286,7 +285,7 @@ def test_what_has_no_margins_says_why():
             judge(late)
 
 
-@killed_by("cli.show_margins", "for channel, one in found.channels.items():", "for channel, one in ():")
+@killed_by("cli.show_margins", "for channel, single in all_margins.channels.items():", "for channel, single in ():")
 def test_the_command_says_margins_of_each_channel():
     text = command("margins", "quadruple-tank")
     for words in ("pump_1", "pump_2", "at the controls"):
