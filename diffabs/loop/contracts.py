@@ -18,13 +18,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core import kinds
-from diffabs.core.blocks import offers
+from diffabs.core.blocks import Parallel, offers
 from diffabs.core.channels import has_channels
 from diffabs.core.protocols import Clock, Ending, Memory, Objective, Sample, Tracking, resting_segment
 from diffabs.core.pytree import canonical_dtypes, stack_lists
 from diffabs.host.values import kebab_case
 from diffabs.loop.closed_loop import Loop
 
+# The part that holds parts for one number each, of a loop with several inputs.
+FOR_CHANNELS = {"controller": "per-channel", "actuator": "per-control", "sensor": "per-output"}
 STEP = 1e-3  # [s] arbitrary: only its type matters
 # folders whose code is not the user's: this package, Python's library, and installed packages such as JAX
 NOT_USERS = (pathlib.Path(__file__).parents[1], pathlib.Path(jax.__file__).parents[1], *map(pathlib.Path, {
@@ -73,6 +75,8 @@ def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[st
                 _follow_objective(path, objective, sample, ending)
             except Misfit as error:
                 lines.append(str(error))
+            except ValueError as error:
+                lines.append(f"{path}: {error}")
 
     jax.eval_shape(trace, *canonical_dtypes((stack_lists(loop), dict(objectives))))
     yield from lines
@@ -98,13 +102,7 @@ def _follow_loop(loop: Loop) -> tuple[Sample, Ending]:
     feedforward = _call("feedforward", loop.feedforward, "input", plant, measured, setpoint)
     _expect_control("feedforward.input", feedforward, plant)
     tracking = Tracking(target, measured, feedforward)
-    try:
-        command = _follow_block("controller", loop.controller, tracking)
-    except Misfit as error:
-        if not has_channels(tracking.feedforward):
-            raise
-        controls = ", ".join(tracking.feedforward._fields)
-        raise Misfit(f"{error}; per-channel has a controller for each of the plant's controls {controls}") from error
+    command = _follow_block("controller", loop.controller, tracking)
     _expect_control("controller.output", command, plant)
     control = _follow_block("actuator", loop.actuator, command)
     _expect_control("actuator.output", control, plant)
@@ -120,6 +118,19 @@ def _follow_loop(loop: Loop) -> tuple[Sample, Ending]:
 
 def _follow_block(name: str, block: object, signal: object) -> Any:
     """Call each method of a block once, and return its output."""
+    try:
+        return _call_block(name, block, signal)
+    except Misfit as error:
+        channels: Any = signal.feedforward if isinstance(signal, Tracking) else signal
+        if name not in FOR_CHANNELS or not has_channels(channels) or isinstance(block, Parallel):
+            raise
+        if name == "sensor" and not hasattr(type(channels), "tracked"):
+            raise
+        named = ", ".join(type(channels)._fields)
+        raise Misfit(f"{error}; {FOR_CHANNELS[name]} has one for each of {named}") from error
+
+
+def _call_block(name: str, block: object, signal: object) -> Any:
     t = jnp.asarray(0.0)
     memory = _call(name, block, "start", signal)
     _expect_memory(f"{name}.start", memory)

@@ -103,7 +103,7 @@ def cascade(**options):
     return Cascade(outer=outer, inner=inner, **options)
 
 
-@killed_by("parts.controllers.cascade", "(name, *(field for", "(*names, *(field for")
+@killed_by("parts.controllers.cascade", "put_first(signal.measured, name)", "signal.measured")
 @killed_by(
     "parts.controllers.cascade",
     "zip(memory.flow, memory.held, strict=True)",

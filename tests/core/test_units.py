@@ -30,8 +30,8 @@ def test_a_plant_says_the_unit_of_its_control(plant, unit):
 @pytest.mark.slow
 @killed_by(
     "loop.convert",
-    "control = plant.control_unit if plant is not None else",
-    'control = "N m" if plant is not None else',
+    "controls = control_units(plant) if plant is not None else",
+    'controls = {"control": "N m"} if plant is not None else',
 )
 def test_the_csv_file_of_the_lab_rig(tmp_path):
     run("simulate", "lab-rig", *SHORT, "--csv", tmp_path / "run.csv")

@@ -413,10 +413,43 @@ def test_a_full_gain_is_that_of_the_linear_model():
     np.testing.assert_allclose(run.ending.sample.output, exact, rtol=1e-7)
 
 
+def full_gain(**changes):
+    """Return a `MatrixFeedback` of two controls, targets and states, with other fields in place of some."""
+    fields = {
+        "gain": -np.ones((2, 4)),
+        "outputs_at_rest": np.zeros(2),
+        "windup": np.zeros((2, 2)),
+        "low": np.zeros(2),
+        "high": np.ones(2),
+        "states": ("a", "b"),
+    }
+    return controllers.MatrixFeedback(**{**fields, **changes})
+
+
 MISFITS = {
+    "a gain of one row": (
+        {"controller": full_gain(gain=-np.ones((1, 4)))},
+        r"controller.gain has shape \(1, 4\); \(2, 4\) is needed, for 2 controls, 2 targets and 2 states",
+    ),
+    "a rest of one": (
+        {"controller": full_gain(outputs_at_rest=np.ones(1))},
+        r"controller.outputs_at_rest has shape \(1,\); \(2,\) is needed, for the states a, b",
+    ),
+    "a limit of one": ({"controller": full_gain(low=(0.0,))}, r"controller.low has shape \(1,\); \(2,\) is needed"),
+    "limits that cross": ({"controller": full_gain(low=np.array([2.0, 0.0]))}, "low exceeds high for a control"),
+    "a state of no output": ({"controller": full_gain(states=("a", "c"))}, "controller: c is no output of the plant"),
+    "an actuator of one": ({"actuator": actuators.Lag()}, "per-control has one for each of left, right"),
+    "a group that is a name": (
+        {
+            "controller": controllers.SelectLow(
+                controller=controllers.PerChannel(PIDS, CHANNELS), groups=("left", "right")
+            )
+        },
+        "groups: left is one name; lists of names are needed",
+    ),
     "a controller of one": (
         {"controller": controllers.PID(cutoff=1.0)},
-        "per-channel has a controller for each of the plant's controls left, right",
+        "per-channel has one for each of left, right",
     ),
     "a target of one": (
         {"reference": references.Setpoint()},

@@ -134,7 +134,7 @@ def test_a_package_that_is_missing_is_named(run, package, monkeypatch):
 
 
 @killed_by("loop.convert", "np.asarray(values)[:rows])", "np.asarray(values))")
-@killed_by("loop.convert", "plant.control_unit if plant is not None else DEFAULT_CONTROL_UNIT", "DEFAULT_CONTROL_UNIT")
+@killed_by("loop.convert", "control_units(plant) if plant is not None else {}", "{}")
 def test_frames_have_units_and_end_where_the_run_does(run):
     count = int(np.sum(run.trajectory.running)) + 1
     frame, plant = run.pandas(rig().plant), rig().plant

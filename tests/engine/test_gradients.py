@@ -228,10 +228,62 @@ LOOPS = {
         actuator=actuators.Delay(time=0.0123, capacity=64),
     ),
 }
+TANK, CHANNELS = plants.QuadrupleTank(), {"pump_1": "level_1", "pump_2": "level_2"}
+LIMITS = {"low": np.zeros(2), "high": np.full(2, 10.0), "windup": np.diag([-0.2, -0.3])}
+
+
+def tank(**parts):
+    """Return a loop of two inputs, away from its targets."""
+    initial = plants.TankStart(level_1=0.12, level_2=0.13, level_3=0.02, level_4=0.015)
+    return d.Loop(plant=TANK, **{**TANK.usual_parts(), "initial": initial, **parts})
+
+
+LOOPS |= {
+    "two inputs": tank(
+        sensor=sensors.PerOutput(
+            sensor={
+                "level_1": actuators.Lag(time_constant=1.5),
+                "level_2": sensors.OutputNoise(deviation=1e-4, period=0.5),
+            }
+        ),
+        actuator=actuators.PerControl(actuator={"pump_1": actuators.Lag(time_constant=0.8)}),
+    ),
+    "two inputs, lowest": tank(
+        controller=controllers.SelectLow(
+            controller=controllers.PerChannel(controllers.PID(kp=150.0, ki=5.0, cutoff=1.0), CHANNELS),
+            groups=(("pump_1", "pump_2"),),
+        )
+    ),
+    "two inputs, gain": tank(
+        controller=controllers.MatrixFeedback(
+            gain=-np.array([[5.0, 1.0, 150.0, 10.0, 20.0, 3.0], [0.5, 4.0, 8.0, 130.0, 5.0, 15.0]]),
+            outputs_at_rest=np.array([0.134, 0.127, 0.015, 0.017]),
+            states=("level_1", "level_2", "level_3", "level_4"),
+            **LIMITS,
+        )
+    ),
+    "two inputs, observed": tank(
+        controller=controllers.ObservedFeedback(
+            gain=-np.array([[5.0, 1.0, 150.0, 10.0], [0.5, 4.0, 8.0, 130.0]]),
+            state_matrix=-np.array([[0.02, 0.001], [0.002, 0.01]]),
+            input_matrix=np.array([[8e-4, 1e-4], [1e-4, 6e-4]]),
+            output_matrix=np.array([[1.0, 0.1], [0.05, 1.0]]),
+            observer_gain=np.array([[0.3, 0.02], [0.01, 0.2]]),
+            outputs_at_rest=np.array([0.134, 0.127]),
+            outputs=("level_1", "level_2"),
+            **LIMITS,
+        )
+    ),
+}
+OF_CHANNELS = {
+    "iae": objectives.OverChannels(objective=objectives.IAE(), channels=tuple(CHANNELS.items()), weights=(1.0, 2.0)),
+    "effort": objectives.InChannel(objective=objectives.Effort(), control="pump_2", output="level_2"),
+}
 SOLVERS = dict.fromkeys(LOOPS, d.FixedStep(5e-4, 0.8)) | {
     "feedback": d.FixedStep(2.5e-4, 0.4),
     "arm": d.FixedStep(1e-3, 0.3),
     "arm, observed": d.FixedStep(1e-3, 0.1),
+    **{name: d.FixedStep(0.25, 15.0) for name in LOOPS if name.startswith("two inputs")},
 }
 # Step of the differences and what they may miss: their own truncation (an oscillating end wants a smaller step), and a
 # kink that moves inside an integration step, where the derivative of the numerical run jumps by O(h).
@@ -273,7 +325,11 @@ SLOW = (
         "valve",
         "given commands",
     ),
+    *("two inputs", "two inputs, lowest", "two inputs, observed"),
 )
+
+
+MEASURES = {"arm": OF_BALANCE, "two inputs": OF_CHANNELS}
 
 
 @functools.cache
@@ -281,7 +337,7 @@ def flat(name):
     """(names, values, objectives as a function of the values, its Jacobian) of the tunable parameters of a loop."""
     loop = canonical_dtypes(LOOPS[name])
     paths = [p for p, spec, v in parameters(loop) if spec.tunable and np.all(np.isfinite(v))]
-    measures = OF_BALANCE if name.startswith("arm") else OBJECTIVES
+    measures = next((of for word, of in MEASURES.items() if name.startswith(word)), OBJECTIVES)
     values, unravel = jax.flatten_util.ravel_pytree([get(loop, p) for p in paths])
     names = [f"{p}[{i}]" for p in paths for i in range(np.size(get(loop, p)))]
 
@@ -296,9 +352,9 @@ def flat(name):
     return names, values, measured, jax.jit(jax.jacfwd(measured)), list(measures)
 
 
-def differences(measured, x, step):
+def differences(measured, x, step, floor=1e-2):
     """Central differences, relative to the size of each parameter: (log-scale gradient, scale)."""
-    scale = np.maximum(np.abs(x), 1e-2)
+    scale = np.maximum(np.abs(x), floor)
     moves = np.diag(scale * step)
     many = jax.jit(jax.vmap(measured))
     return np.asarray((many(x + moves) - many(x - moves)) / (2 * step)).T, scale
@@ -310,7 +366,8 @@ def test_gradient_of_every_objective_in_every_parameter(name):
     jacobian = np.asarray(jacobian_at(x))
     assert np.all(np.isfinite(jacobian)), [names[j] for j in np.argwhere(~np.isfinite(jacobian))[:, 1]]
     step, tolerance = ACCURACY[name]
-    expected, scale = differences(measured, x, step)
+    # A tank's numbers are small: a flow per volt is some 1e-6.
+    expected, scale = differences(measured, x, step, 1e-8 if name.startswith("two inputs") else 1e-2)
     for i, objective in enumerate(measures):
         largest = np.max(np.abs(expected[i]))
         error = np.abs(jacobian[i] * scale - expected[i])
@@ -411,6 +468,7 @@ def test_every_part_is_differentiated_in_some_loop():
         yield type(part).__name__
         for field in dataclasses.fields(part):
             value = getattr(part, field.name)
+            value = tuple(value.values()) if isinstance(value, dict) else value
             for item in value if isinstance(value, tuple) else (value,):
                 if dataclasses.is_dataclass(item):
                     yield from classes(item)

@@ -58,9 +58,7 @@ def quiet(rig, speed, case):
 
 
 @pytest.mark.slow
-@killed_by(
-    "parts.controllers.sampled_on_grid", "waits * m.last + (1 - waits) * m.next", "m.next", case="all wrong-known"
-)
+@killed_by("parts.controllers.sampled_on_grid", "waits * last + (1 - waits) * latest", "latest", case="all wrong-known")
 @killed_by(
     "parts.sensors.speed",
     "error = self.last + (self.first - self.last) * jnp.exp(-t / self.time_constant)",

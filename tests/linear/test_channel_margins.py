@@ -180,7 +180,6 @@ def step_matrix(opened, delays):
     return np.stack([step(unit) for unit in np.eye(size)], axis=1)
 
 
-@killed_by("linear.channel_loop", "delays = np.full(len(self.whole.channels), self.delay)", "delays = np.zeros(2)")
 def test_the_delay_margin_of_a_sampled_channel_is_where_the_loop_turns_unstable():
     opened = open_loop(tank(controller=sampled(0.2, pump_1=(600.0, 20.0))))
     for i, channel in enumerate(CHANNELS):

@@ -173,7 +173,7 @@ def test_choices_of_a_part_of_ones_own_are_read_again(changes, tmp_path, file):
 
 
 @killed_by("scenario.registry", "    if isinstance(part, tuple | list):", "    if isinstance(part, tuple):")
-@killed_by("scenario.registry", "if isinstance(value, tuple | list) else", "if isinstance(value, tuple) else")
+@killed_by("scenario.registry", "if isinstance(items, tuple | list) else", "if isinstance(items, tuple) else")
 def test_parts_in_a_list_are_described_like_those_in_a_tuple():
     listed, tupled = (roads.Patches(roads=kind([roads.SNOW, roads.SPLINE_B]), edges=[5.0]) for kind in (list, tuple))
     assert [path for path, _ in registry.part_choices(listed, "road")] == ["road", "road.roads.0", "road.roads.1"]

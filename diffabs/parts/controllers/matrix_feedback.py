@@ -10,16 +10,19 @@ Source: K. J. Astrom and R. M. Murray, Feedback Systems, 2nd ed. (2021), sec. 7.
 (observer, Kalman filter).
 """
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.arrays import as_rule_array
 from diffabs.core.channels import outputs_like
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import param, pytree, static
+from diffabs.core.rules import Rule
 from diffabs.core.types import Array, Matrix, PyTree, Scalar, Vector
 
 
@@ -33,18 +36,36 @@ class MatrixGain:
 
     def commands(self, integrals: Array, state: Array, signal: Tracking) -> tuple[Array, Array]:
         """Return the commands before and after the limits, shape (m,), for a state relative to rest."""
-        raw = as_vector(signal.feedforward) + self.gain @ jnp.concatenate([integrals, state])
-        limited: Any = clamp(raw, self.low, self.high)
+        ahead = as_vector(signal.feedforward)
+        m, p, n = len(ahead), len(integrals), len(state)
+        needs = f"{m} controls, {p} targets and {n} states"
+        for name, shape in {"gain": (m, p + n), "windup": (p, m), "low": (m,), "high": (m,)}.items():
+            expect_shape(self, name, shape, needs)
+        raw = ahead + jnp.asarray(self.gain) @ jnp.concatenate([integrals, state])
+        limited: Any = clamp(raw, jnp.asarray(self.low), jnp.asarray(self.high))
         return raw, limited
 
     def limits(self) -> tuple[Vector, Vector]:
         """Return the lower and the upper limits of the controls."""
         return self.low, self.high
 
+    def rules(self) -> Iterator[Rule]:
+        """Yield the rule low <= high."""
+        low, high = as_rule_array(self.low), as_rule_array(self.high)
+        if low.shape == high.shape:
+            line = "low exceeds high for a control"
+            yield Rule((low <= high).all(), line, lambda: line)
+
     def integral_rates(self, raw: Array, limited: Array, signal: Tracking) -> Array:
         """Return z', shape (p,), as the limits change it."""
         errors = as_vector(outputs_like(signal.measured, signal.target)) - as_vector(signal.target)
-        return errors + self.windup @ (limited - raw)
+        return errors + jnp.asarray(self.windup) @ (limited - raw)
+
+
+def expect_shape(part: object, name: str, shape: tuple[int, ...], needs: str) -> None:
+    """Raise a ValueError for a field of another shape; `needs` says what decides it."""
+    if (given := np.shape(getattr(part, name))) != shape:
+        raise ValueError(f"controller.{name} has shape {given}; {shape} is needed, for {needs}")
 
 
 @pytree
@@ -88,8 +109,9 @@ class MatrixFeedback(MatrixGain):
         return like_signal(self._commands(memory, signal)[1], signal.feedforward)
 
     def _commands(self, memory: Memory, signal: Tracking) -> tuple[Array, Array]:
-        state = [getattr(signal.measured, name) for name in self.states]
-        return self.commands(memory.flow, jnp.stack(state) - self.outputs_at_rest if state else jnp.zeros(0), signal)
+        expect_shape(self, "outputs_at_rest", (len(self.states),), f"the states {', '.join(self.states)}")
+        state = read_outputs(signal, self.states)
+        return self.commands(memory.flow, state - jnp.asarray(self.outputs_at_rest), signal)
 
 
 class Estimate(NamedTuple):
@@ -141,16 +163,28 @@ class ObservedFeedback(MatrixGain):
         del t
         estimate: Estimate = memory.flow
         raw, limited = self.commands(estimate.integrals, estimate.state, signal)
-        measured = jnp.stack([getattr(signal.measured, name) for name in self.outputs])
-        surprise = measured - self.outputs_at_rest - self.output_matrix @ estimate.state
-        moved = self.state_matrix @ estimate.state + self.input_matrix @ (limited - as_vector(signal.feedforward))
-        return Estimate(self.integral_rates(raw, limited, signal), moved + self.observer_gain @ surprise)
+        n, q, m = len(estimate.state), len(self.outputs), len(raw)
+        shapes = {"state_matrix": (n, n), "input_matrix": (n, m), "output_matrix": (q, n), "observer_gain": (n, q)}
+        for name, shape in {**shapes, "outputs_at_rest": (q,)}.items():
+            expect_shape(self, name, shape, f"{n} states, {q} outputs and {m} controls")
+        a, b, c, gain = (jnp.asarray(getattr(self, name)) for name in shapes)
+        surprise = read_outputs(signal, self.outputs) - jnp.asarray(self.outputs_at_rest) - c @ estimate.state
+        moved = a @ estimate.state + b @ (limited - as_vector(signal.feedforward))
+        return Estimate(self.integral_rates(raw, limited, signal), moved + gain @ surprise)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> PyTree:
         """Return the limited commands."""
         del t
         estimate: Estimate = memory.flow
         return like_signal(self.commands(estimate.integrals, estimate.state, signal)[1], signal.feedforward)
+
+
+def read_outputs(signal: Tracking, names: tuple[str, ...]) -> Array:
+    """Return the measured outputs of these names as an array."""
+    if unknown := [name for name in names if not hasattr(signal.measured, name)]:
+        there = ", ".join(signal.measured._fields)
+        raise ValueError(f"controller: {', '.join(unknown)} is no output of the plant; there is {there}")
+    return jnp.stack([getattr(signal.measured, name) for name in names]) if names else jnp.zeros(0)
 
 
 def as_vector(signal: PyTree) -> Array:

@@ -28,7 +28,8 @@ class PerChannel(Parallel):
         `objectives.InChannel`: Metrics of one channel.
 
     Notes:
-        `channels` gives for each control of the plant (`plant.controls`) the output that it controls. With a single
+        `channels` gives for each control of the plant (`plant.controls`) the output that it controls; a control without
+        a channel gets its feed-forward alone. With a single
         controller all channels have the same gains, but memories of their own: its parameters are at
         `controller.controller.kp`. With one for each control they are at `controller.pump_1.kp`.
 
@@ -99,3 +100,9 @@ class SelectLow(ChangedCommand):
             lowest = reduce(smaller, (select_channel(command, name) for name in group))
             command = command._replace(**dict.fromkeys(group, lowest))
         return command
+
+    def problems(self) -> Iterator[str]:
+        """Yield a line for a group that is no list of names."""
+        for group in self.groups:
+            if isinstance(group, str):
+                yield f'groups: {group} is one name; lists of names are needed, such as [["left", "right"]]'
