@@ -417,12 +417,13 @@ def _rebuild_parts(part: object, method: str, args: Callable[[str], tuple[PyTree
     if not dataclasses.is_dataclass(part):
         return part
 
-    def rebuild(name: str, value: object) -> PyTree:
-        if isinstance(value, dict):
-            return {key: _rebuild_parts(item, method, args, f"{prefix}{key}.") for key, item in value.items()}
-        return _rebuild_parts(value, method, args, f"{prefix}{name}.")
-
-    fields = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
-    inner = {name: rebuild(name, getattr(part, name)) for name in fields}
+    inner = {}
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        if isinstance(value, dict) and field.metadata.get("named"):
+            items = {key: _rebuild_parts(item, method, args, f"{prefix}{key}.") for key, item in value.items()}
+            inner[field.name] = items
+        elif "part" in field.metadata:
+            inner[field.name] = _rebuild_parts(value, method, args, f"{prefix}{field.name}.")
     part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
     return getattr(part, method)(*args(prefix)) if hasattr(part, method) else part

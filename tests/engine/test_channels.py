@@ -486,3 +486,13 @@ def test_the_channels_of_a_controller_cannot_change():
     assert hash(channels) == hash(Channels({"left": "a"}))
     assert channels != Channels({"left": "b"})
     assert not hasattr(channels, "__setitem__")
+
+
+def test_a_field_keeps_the_type_of_its_arguments():
+    """Only parts by name are looked into: the dictionary of a field's arguments is no such part."""
+
+    def decay(t, y, args):
+        return -args.a * y
+
+    solution = d.solve(decay, jnp.array([1.0]), 0.0, 1.0, Single(2.0), solver=d.Adaptive(1e-8))
+    np.testing.assert_allclose(solution.y, np.exp(-2.0), rtol=1e-7)

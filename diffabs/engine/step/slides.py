@@ -52,6 +52,8 @@ LOST_RETURNS = 12  # returns since the last calm step with which a slide is lost
 # Fraction of the fall: a margin at the beginning of a step that is farther from a line through zero is rounding.
 MAX_LINE_ERROR = 0.5
 MAX_SURFACES = 2  # along which a run can slide at the same time
+# Of both margins, by which they differ if nothing jumps; of both rates, with which a margin leaves zero.
+MAX_MARGIN_JUMP, MAX_STRAY = 1e-9, 1e-6
 MAX_SHARE = 2.0  # of the other side, where the run leaves a surface to it
 
 Look = Callable[[Scalar, PyTree, Mode], tuple[PyTree, ComparisonAnswers]]  # of time, flow, mode; begins with the rates
@@ -262,12 +264,16 @@ class _Sides(NamedTuple):
         answers: Answers of the mode.
         margins: Margins of the comparisons along whose surfaces the run slides.
         pushes: Rates of each of these margins, shape (sides,).
+        all_margins: Margins of all comparisons with the answers of each side, shape (sides, comparisons).
+        all_pushes: Rates of all margins with the answers of the mode, shape (sides, comparisons).
     """
 
     dynamics: PyTree
     answers: ComparisonAnswers
     margins: list[Scalar]
     pushes: list[Array]
+    all_margins: Array
+    all_pushes: Array
 
 
 def slide(look: Look, t: Scalar, z: PyTree, mode: Mode) -> SlidingDynamics:
@@ -275,8 +281,13 @@ def slide(look: Look, t: Scalar, z: PyTree, mode: Mode) -> SlidingDynamics:
     sides = _look_at_sides(look, t, z, mode)
     shares = _balance(sides.pushes, mode.along, [rates[0] for rates in sides.pushes])
 
+    strayed = _strays(sides, mode, shares)
+
     def mix(x: Array) -> AnyArray:
-        return sum((share * (x[i] - x[0]) for i, share in enumerate(shares, 1)), x[0]) if _is_real(x) else x[0]
+        if not _is_real(x):
+            return x[0]
+        # A step with NaN is not accepted, and the run is reported as one that slides.
+        return jnp.where(strayed, jnp.nan, sum((share * (x[i] - x[0]) for i, share in enumerate(shares, 1)), x[0]))
 
     judged = _turn_outward(shares, sides.pushes)
     return SlidingDynamics(jax.tree.map(mix, sides.dynamics), _answer_by_shares(sides.answers, mode, judged), judged)
@@ -303,19 +314,41 @@ def _look_at_sides(look: Look, t: Scalar, z: PyTree, mode: Mode) -> _Sides:
     )
     base, answers = look(t, z, Mode(mode.words, released=loose))
 
-    def side(reversed: ModeBits) -> PyTree:
-        return look(t, z, Mode(tuple(a ^ b for a, b in zip(answers.words, reversed, strict=True))))[0]
+    def side(reversed: ModeBits) -> tuple[PyTree, Array]:
+        rates, there = look(t, z, Mode(tuple(a ^ b for a, b in zip(answers.words, reversed, strict=True))))
+        return rates, there.margins
 
-    others = jax.vmap(side)(stack_surfaces(mode.along).answers)
-    dynamics = jax.tree.map(lambda x, more: jnp.concatenate([jnp.asarray(x)[None], more]), base, others)
+    def join(x: Array, more: Array) -> Array:
+        return jnp.concatenate([jnp.asarray(x)[None], more])
 
-    def list_margins(t: Scalar, z: PyTree) -> list[Scalar]:
-        at = look(t, z, Mode(answers.words))[1]
-        return [pick_number(at.numbers, surface.number, at.margins) for surface in mode.along]
-
-    margins, move = jax.linearize(list_margins, t, z)
+    others, other_margins = jax.vmap(side)(stack_surfaces(mode.along).answers)
+    dynamics = jax.tree.map(join, base, others)
+    margins, move = jax.linearize(lambda t, z: look(t, z, Mode(answers.words))[1].margins, t, z)
     pushes = jax.vmap(lambda rates: move(jnp.ones_like(t), rates))(dynamics[:2])
-    return _Sides(dynamics, answers, margins, pushes)
+
+    def pick(values: Array) -> list[Array]:
+        return [pick_number(answers.numbers, surface.number, values) for surface in mode.along]
+
+    return _Sides(
+        dynamics, answers, pick(margins), jax.vmap(pick)(pushes), join(answers.margins, other_margins), pushes
+    )
+
+
+def _strays(sides: _Sides, mode: Mode, shares: tuple[Scalar, ...]) -> Bool:
+    """Return True if the flow along the surfaces leaves the zero of a comparison whose answer changes with theirs.
+
+    Such a comparison has a surface of its own, which the run met at the same instant. A comparison that reads what
+    jumps at the surface has no such zero: its margins with the answers of both sides differ by more than the sign.
+    """
+    numbers, pushes, strays = sides.answers.numbers, sides.all_pushes, jnp.asarray(False)
+    flow = sum((share * (pushes[i] - pushes[0]) for i, share in enumerate(shares, 1)), pushes[0])
+    own = reduce(jnp.logical_or, [numbers == surface.number for surface in mode.along])
+    for i, surface in enumerate(mode.along, 1):
+        here, there = sides.all_margins[0], sides.all_margins[i]
+        steady = jnp.abs(here + there) <= MAX_MARGIN_JUMP * (jnp.abs(here) + jnp.abs(there))
+        leaves = jnp.abs(flow) > MAX_STRAY * larger(jnp.abs(pushes[0]), jnp.abs(pushes[i]))
+        strays |= jnp.any(read_bits(surface.answers, numbers) & ~own & steady & leaves & surface.exists)
+    return strays
 
 
 def _is_real(x: Array) -> bool:
