@@ -326,7 +326,7 @@ def _look_at_sides(look: Look, t: Scalar, z: PyTree, mode: Mode) -> _Sides:
     margins, move = jax.linearize(lambda t, z: look(t, z, Mode(answers.words))[1].margins, t, z)
     pushes = jax.vmap(lambda rates: move(jnp.ones_like(t), rates))(dynamics[:2])
 
-    def pick(values: Array) -> list[Array]:
+    def pick(values: Array) -> list[Any]:
         return [pick_number(answers.numbers, surface.number, values) for surface in mode.along]
 
     return _Sides(
