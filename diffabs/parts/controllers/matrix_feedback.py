@@ -74,7 +74,7 @@ class MatrixFeedback(MatrixGain):
 
     See also:
         `linear.lqr`: The gain for weights of states and controls.
-        `ObservedFeedback`: The same with an estimated state.
+        `controllers.ObservedFeedback`: The same with an estimated state.
 
     Notes:
         The order of the controls is that of the plant's `controls`, the order of z that of the targets.
