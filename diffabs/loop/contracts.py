@@ -210,8 +210,11 @@ def _place(error: Exception) -> str:
 def _check_shown(plant: object, output: object) -> None:
     """Check a plant's output, its declared types `shows` and `controls` with their units, and `control_unit`."""
     _expect_reals("plant.output", output)
-    unit, shows, controls = (getattr(plant, name, None) for name in ("control_unit", "shows", "controls"))
-    if unit is not None and not isinstance(unit, str):
+    unit, shows, controls = (
+        getattr(plant, "control_unit", ""),
+        *(getattr(plant, n, None) for n in ("shows", "controls")),
+    )
+    if not isinstance(unit, str):
         raise Misfit(f"plant.control_unit = {kinds.format_value(unit)} is no text, such as 'N m'")
     if controls is not None:
         _check_named("controls", controls)

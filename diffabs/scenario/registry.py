@@ -390,7 +390,13 @@ def describe_part(family: str, part: Part) -> dict[str, JsonObject]:
     for field in dataclasses.fields(part):
         value, spec = getattr(part, field.name), field.metadata.get("spec")
         spec = spec and spec.around(DEFAULT_UNITS)
-        row = {"default": value, "unit": "", "range": "", "low": None, "high": None}
+        row = {
+            "default": dict(value) if isinstance(value, Channels) else value,
+            "unit": "",
+            "range": "",
+            "low": None,
+            "high": None,
+        }
         if "part" in field.metadata:
             inner = family_of(field.name, family)
             items = tuple(value.values()) if isinstance(value, dict) else value

@@ -87,9 +87,9 @@ class MatrixFeedback(MatrixGain):
     """Outputs at rest x0, shape (n,), each in its unit."""
     windup: Matrix = param(default=np.zeros((1, 1)), unit="1", free=True)
     """Matrix E of the anti-windup, shape (p, m); zeros for none."""
-    low: Vector = param(default=(-np.inf,), unit="control", infinite=True, free=True)
+    low: Vector = param(default=(-1.0,), unit="control", infinite=True, free=True)
     """Lower limit of the control, shape (m,), one for each."""
-    high: Vector = param(default=(np.inf,), unit="control", infinite=True, free=True)
+    high: Vector = param(default=(1.0,), unit="control", infinite=True, free=True)
     """Upper limit of the control, shape (m,), one for each."""
     states: tuple[str, ...] = static(default=())
     """Names of the outputs that are the states x, n of them."""
@@ -146,9 +146,9 @@ class ObservedFeedback(MatrixGain):
     """Outputs at rest y0, shape (q,), each in its unit."""
     windup: Matrix = param(default=np.zeros((1, 1)), unit="1", free=True)
     """Matrix E of the anti-windup, shape (p, m); zeros for none."""
-    low: Vector = param(default=(-np.inf,), unit="control", infinite=True, free=True)
+    low: Vector = param(default=(-1.0,), unit="control", infinite=True, free=True)
     """Lower limit of the control, shape (m,), one for each."""
-    high: Vector = param(default=(np.inf,), unit="control", infinite=True, free=True)
+    high: Vector = param(default=(1.0,), unit="control", infinite=True, free=True)
     """Upper limit of the control, shape (m,), one for each."""
     outputs: tuple[str, ...] = static(default=())
     """Names of the measured outputs y, q of them."""
