@@ -315,8 +315,8 @@ def _look_at_sides(look: Look, t: Scalar, z: PyTree, mode: Mode) -> _Sides:
     base, answers = look(t, z, Mode(mode.words, released=loose))
 
     def side(reversed: ModeBits) -> tuple[PyTree, Array]:
-        rates, there = look(t, z, Mode(tuple(a ^ b for a, b in zip(answers.words, reversed, strict=True))))
-        return rates, there.margins
+        rates, others = look(t, z, Mode(tuple(a ^ b for a, b in zip(answers.words, reversed, strict=True))))
+        return rates, others.margins
 
     def join(x: Array, more: Array) -> Array:
         return jnp.concatenate([jnp.asarray(x)[None], more])
@@ -342,12 +342,12 @@ def _strays(sides: _Sides, mode: Mode, shares: tuple[Scalar, ...]) -> Bool:
     """
     numbers, pushes, strays = sides.answers.numbers, sides.all_pushes, jnp.asarray(False)
     flow = sum((share * (pushes[i] - pushes[0]) for i, share in enumerate(shares, 1)), pushes[0])
-    own = reduce(jnp.logical_or, [numbers == surface.number for surface in mode.along])
+    followed = reduce(jnp.logical_or, [numbers == surface.number for surface in mode.along])
     for i, surface in enumerate(mode.along, 1):
-        here, there = sides.all_margins[0], sides.all_margins[i]
-        steady = jnp.abs(here + there) <= MAX_MARGIN_JUMP * (jnp.abs(here) + jnp.abs(there))
+        near, beyond = sides.all_margins[0], sides.all_margins[i]
+        steady = jnp.abs(near + beyond) <= MAX_MARGIN_JUMP * (jnp.abs(near) + jnp.abs(beyond))
         leaves = jnp.abs(flow) > MAX_STRAY * larger(jnp.abs(pushes[0]), jnp.abs(pushes[i]))
-        strays |= jnp.any(read_bits(surface.answers, numbers) & ~own & steady & leaves & surface.exists)
+        strays |= jnp.any(read_bits(surface.answers, numbers) & ~followed & steady & leaves & surface.exists)
     return strays
 
 

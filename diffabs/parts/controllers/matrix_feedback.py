@@ -64,8 +64,8 @@ class MatrixGain:
 
 def expect_shape(part: object, name: str, shape: tuple[int, ...], needs: str) -> None:
     """Raise a ValueError for a field of another shape; `needs` says what decides it."""
-    if (given := np.shape(getattr(part, name))) != shape:
-        raise ValueError(f"controller.{name} has shape {given}; {shape} is needed, for {needs}")
+    if (actual := np.shape(getattr(part, name))) != shape:
+        raise ValueError(f"controller.{name} has shape {actual}; {shape} is needed, for {needs}")
 
 
 @pytree
@@ -182,8 +182,8 @@ class ObservedFeedback(MatrixGain):
 def read_outputs(signal: Tracking, names: tuple[str, ...]) -> Array:
     """Return the measured outputs of these names as an array."""
     if unknown := [name for name in names if not hasattr(signal.measured, name)]:
-        there = ", ".join(signal.measured._fields)
-        raise ValueError(f"controller: {', '.join(unknown)} is no output of the plant; there is {there}")
+        outputs = ", ".join(signal.measured._fields)
+        raise ValueError(f"controller: {', '.join(unknown)} is no output of the plant; there is {outputs}")
     return jnp.stack([getattr(signal.measured, name) for name in names]) if names else jnp.zeros(0)
 
 
