@@ -391,7 +391,7 @@ def describe_part(family: str, part: Part) -> dict[str, JsonObject]:
         value, spec = getattr(part, field.name), field.metadata.get("spec")
         spec = spec and spec.around(DEFAULT_UNITS)
         row = {
-            "default": dict(value) if isinstance(value, Channels) else value,
+            "default": dict(value) if type(value) is Channels else value,
             "unit": "",
             "range": "",
             "low": None,
@@ -408,7 +408,7 @@ def describe_part(family: str, part: Part) -> dict[str, JsonObject]:
             ends = {"low": spec.low, "high": spec.high}
             ends = {name: end if math.isfinite(end) else None for name, end in ends.items()}
             row |= {"default": np.asarray(value, float).tolist(), "unit": spec.unit, "range": spec.interval(), **ends}
-        elif ends := _whole_range(field, value):
+        elif ends := _whole_range(field, getattr(part, field.name)):
             low, high = ends
             row |= {"range": f"[{low}, {high}]", "low": low, "high": high}
         rows[field.name] = {"meaning": meanings.get(field.name, ""), **row}
