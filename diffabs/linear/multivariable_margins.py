@@ -211,7 +211,7 @@ def _return_difference(
 
 
 def _sensitivities(values: np.ndarray) -> np.ndarray:
-    """Return S = (I + L)^-1, (k, m, m); at a pole of L it is that of a very large L."""
+    """Return S = (I + L)^-1, (k, m, m); NaN at a pole of L."""
     identity = np.eye(values.shape[1])
     finite = np.isfinite(values).all(axis=(1, 2))
     s = np.zeros_like(values)

@@ -11,12 +11,13 @@ import pytest
 from marks import cases
 from mutants import killed_by
 from scipy.integrate import solve_ivp
+from scipy.linalg import solve_continuous_are
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, sensors, stops
 from diffabs.core.blocks import ChangedCommand, Direct, Parallel
 from diffabs.core.channels import Channels
-from diffabs.core.protocols import Block
+from diffabs.core.protocols import Block, Memory, Tracking
 from diffabs.core.pytree import get, param, part, pytree
 from diffabs.core.types import Scalar
 
@@ -411,6 +412,78 @@ def test_a_full_gain_is_that_of_the_linear_model():
     closed = np.block([[big_a + big_b @ gain, np.vstack([-np.eye(2), np.zeros((2, 2))])], [np.zeros((2, 6))]])
     exact = (expm(4.0 * closed) @ np.concatenate([np.zeros(4), target]))[2:4]
     np.testing.assert_allclose(run.ending.sample.output, exact, rtol=1e-7)
+
+
+def test_targets_have_one_order_in_and_outside_of_compiled_functions():
+    """JAX rebuilds a dictionary with sorted keys."""
+    given = {"b": references.Setpoint(value=2.0), "a": references.Setpoint(value=1.0)}
+    reference = references.PerTarget(reference=given)
+    rebuilt = jax.jit(lambda part: part)(reference)
+    for part_ in (reference, rebuilt):
+        memory = part_.start(PairOutput(0.0, 0.0))
+        assert part_.setpoint(memory)._fields == part_.output(0.0, memory, PairOutput(0.0, 0.0))._fields == ("a", "b")
+
+
+def test_an_observer_in_front_of_a_gain_is_the_linear_one():
+    """Plant, observer, integrals and gain as one matrix, whose exponential SciPy has; and L is that of a dual LQR."""
+    from scipy.linalg import expm
+
+    a = np.array([[-1.3, 0.3], [0.3, -0.8]])
+    cost, noise, zero, one = 0.1 * np.eye(2), np.diag([0.2, 0.3]), np.zeros((2, 2)), np.eye(2)
+    gain = np.asarray(d.linear.lqr(np.block([[zero, one], [zero, a]]), np.vstack([zero, one]), np.eye(4), cost).gain)
+    correction = -np.asarray(d.linear.lqr(a.T, one, one, noise).gain).T
+    riccati = solve_continuous_are(a.T, one, one, noise)
+    np.testing.assert_allclose(correction, riccati @ np.linalg.inv(noise), rtol=1e-9)
+    target, start = np.array([1e-5, -2e-5]), np.array([3e-6, 1e-6])  # so small that the bowls are linear
+    loop = pair(
+        plant=TwoTanks(time_a=1.0, time_b=2.0, coupling=0.3),
+        initial=PairStart(a=start[0], b=start[1]),
+        reference=references.PerTarget(
+            reference={"a": references.Setpoint(value=target[0]), "b": references.Setpoint(value=target[1])}
+        ),
+        feedforward=controllers.NoFeedforward(),
+        actuator=Direct(),
+        controller=controllers.ObservedFeedback(
+            gain=gain,
+            state_matrix=a,
+            input_matrix=one,
+            output_matrix=one,
+            observer_gain=correction,
+            outputs_at_rest=np.zeros(2),
+            windup=zero,
+            low=np.full(2, -np.inf),
+            high=np.full(2, np.inf),
+            outputs=("a", "b"),
+        ),
+    )
+    end = d.rollout(loop, d.FixedStep(0.01, 4.0), {}).ending.sample.output
+    integrals, states = gain[:, :2], gain[:, 2:]
+    # The state is (plant, integrals, estimate, target).
+    closed = np.block([
+        [a, integrals, states, zero],
+        [one, zero, zero, -one],
+        [correction, integrals, a + states - correction, zero],
+        [zero, zero, zero, zero],
+    ])  # fmt: skip
+    exact = expm(4.0 * closed) @ np.concatenate([start, np.zeros(4), target])
+    np.testing.assert_allclose(end, exact[:2], rtol=1e-7)
+
+
+@killed_by("parts.controllers.matrix_feedback", "@ (limited - raw)", "@ (raw - limited)")
+def test_the_excess_over_a_limit_decays_with_the_tracking_time():
+    """E = Kz^-1/Tt: at a limit, for a plant and a target at rest, u_raw - u falls as exp(-t/Tt) to Tt Kz e."""
+    tracking, gain = 0.5, np.array([[-2.0, 0.3], [0.1, -1.5]])
+    windup = np.linalg.inv(gain) / tracking
+    controller = full_gain(
+        gain=np.hstack([gain, np.zeros((2, 2))]), windup=windup, low=np.full(2, -0.1), high=np.full(2, 0.1)
+    )
+    errors, z = np.array([0.2, -0.1]), np.array([-0.4, 0.5])
+    signal = Tracking(Pair(0.0, 0.0), PairOutput(*errors), Sides(0.0, 0.0))
+    rate = controller.flow(0.0, Memory(flow=jnp.asarray(z)), signal)
+    raw = gain @ z
+    excess = raw - np.clip(raw, -0.1, 0.1)
+    assert (np.abs(excess) > 0.1).all()
+    np.testing.assert_allclose(gain @ rate, gain @ errors - excess / tracking, rtol=1e-12)
 
 
 def full_gain(**changes):

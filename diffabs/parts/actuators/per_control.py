@@ -22,8 +22,8 @@ class PerControl(Parallel):
     """Actuator of each control."""
 
     def by_channel(self) -> dict[str, Block]:
-        """Return the actuator of each control."""
-        return self.actuator
+        """Return the actuator of each control, in alphabetical order: JAX rebuilds a dictionary with sorted keys."""
+        return dict(sorted(self.actuator.items()))
 
     def select(self, name: str, signal: PyTree) -> Scalar:
         """Return the command of a control."""

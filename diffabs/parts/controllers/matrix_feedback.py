@@ -77,7 +77,8 @@ class MatrixFeedback(MatrixGain):
         `controllers.ObservedFeedback`: The same with an estimated state.
 
     Notes:
-        The order of the controls is that of the plant's `controls`, the order of z that of the targets.
+        The order of the controls is that of the plant's `controls`, the order of z that of the target's fields. A
+        `references.PerTarget` has them in alphabetical order.
     """
 
     gain: Matrix = param(default=np.zeros((1, 1)), unit="1", free=True)

@@ -15,8 +15,8 @@ from diffabs.core.units import Units
 class PerTarget(Parallel):
     """A reference for each of several outputs, by the output's name: the target has a field for each.
 
-    The names are those in `tracked` of the plant's output type. A reference sees the measured outputs with its own
-    first.
+    The names are those in `tracked` of the plant's output type; the target has them in alphabetical order. A reference
+    sees the measured outputs with its own first.
 
     >>> from diffabs.parts.references import PerTarget, Setpoint
     >>> levels = PerTarget(reference={"level_1": Setpoint(value=0.12), "level_2": Setpoint(value=0.13)})
@@ -26,8 +26,8 @@ class PerTarget(Parallel):
     """Reference of each output."""
 
     def by_channel(self) -> dict[str, Reference]:
-        """Return the reference of each output."""
-        return self.reference
+        """Return the reference of each output, in alphabetical order: JAX rebuilds a dictionary with sorted keys."""
+        return dict(sorted(self.reference.items()))
 
     def select(self, name: str, signal: PyTree) -> PyTree:
         """Return the measured outputs with this one first."""

@@ -31,8 +31,8 @@ class PerOutput(Parallel):
     """Sensor of each output."""
 
     def by_channel(self) -> dict[str, Block]:
-        """Return the sensor of each output."""
-        return self.sensor
+        """Return the sensor of each output, in alphabetical order: JAX rebuilds a dictionary with sorted keys."""
+        return dict(sorted(self.sensor.items()))
 
     def select(self, name: str, signal: PyTree) -> PyTree:
         """Return the output, or the outputs of its channel."""
