@@ -63,7 +63,6 @@ REFUSED = {
         "there are controllers of pump_1, pump_2, pump_3",
     ),
     "a proof": (["certify", "quadruple-tank"], "needs a loop with one control; plant QuadrupleTank has pump_1, pump_2"),
-    "a program": (["export", "quadruple-tank", "--period", "0.5"], "a program for a computer has one command"),
 }
 
 

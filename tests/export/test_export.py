@@ -1,5 +1,6 @@
 """Exported controllers: compiled, and against the parts themselves and against whole runs."""
 
+import collections
 import dataclasses
 import math
 import re
@@ -17,9 +18,18 @@ from mutants import killed_by
 from structured_text import Block
 
 import diffabs as d
+from diffabs.compiler.lower.labels import Labelled
 from diffabs.core.protocols import BalanceOutput, BrakeOutput
-from diffabs.output.export import NotExported, c_source, computer_program, difference_equations, structured_text
+from diffabs.output.export import (
+    NotExported,
+    c_source,
+    computer_program,
+    difference_equations,
+    sample_controller,
+    structured_text,
+)
 from diffabs.output.export.device import Input
+from diffabs.output.export.lowered import MEMORY, name_memory, number_leaves
 from diffabs.output.export.plant_c import plant_source
 from diffabs.parts.controllers import (
     PID,
@@ -29,16 +39,19 @@ from diffabs.parts.controllers import (
     ConstantInput,
     FourPhase,
     HoldingInput,
+    MatrixFeedback,
     ObserverFeedback,
+    PerChannel,
     ProportionalFeedback,
     Sampled,
     SampledOnGrid,
     ScheduledFeedback,
+    SelectLow,
     SlidingMode,
     StateFeedback,
 )
-from diffabs.parts.plants import ArmBalance, LabRig, MirroredRig, QuarterCar
-from diffabs.parts.references import FilteredSlip, FixedSlip, PeakLatch
+from diffabs.parts.plants import ArmBalance, LabRig, MirroredRig, QuadrupleTank, QuarterCar
+from diffabs.parts.references import FilteredSlip, FixedSlip, PeakLatch, PerTarget, Setpoint
 from diffabs.parts.roads import PiecewiseLinear, Tabulated
 from diffabs.scenario.defaults import balancing, braking
 from diffabs.scenario.scenario import load
@@ -61,6 +74,36 @@ def observer():
     return ObserverFeedback(gain=draw.normal(size=6), predicted_high=3.0, **matrices)
 
 
+@d.core.pytree.pytree
+class Approach:
+    """A target that moves from the first measured output to a value."""
+
+    value: float = d.core.pytree.param(default=0.3, unit="signal")
+
+    def start(self, signal):
+        return d.core.protocols.Memory(flow=signal[0])
+
+    def flow(self, t, memory, signal):
+        return (self.value - memory.flow) / 0.035
+
+    def output(self, t, memory, signal):
+        return memory.flow
+
+    def setpoint(self, memory):
+        return self.value
+
+
+def tank(controller, **parts):
+    """A loop with two pumps, whose second target moves by itself."""
+    reference = PerTarget(reference={"level_1": Setpoint(value=0.134), "level_2": Approach()})
+    plant = QuadrupleTank()
+    usual = {**plant.usual_parts(), "reference": reference, "controller": Sampled(controller=controller, period=1e-3)}
+    return d.Loop(plant=plant, **{**usual, **parts})
+
+
+PUMPS = {"pump_1": "level_1", "pump_2": "level_2"}
+K = ((-5.0, 0.3, -60.0, 7.0), (0.2, -3.4, 5.0, -40.0))
+MOVING = {"filtered target", "two channels", "least of two commands"}
 DTYPES = [pytest.param(np.float64, id="float64"), pytest.param(np.float32, id="float32", marks=pytest.mark.slow)]
 LOOPS = {
     "state feedback": rig(StateFeedback(gain=(-300.0, -48.0))),
@@ -78,6 +121,13 @@ LOOPS = {
         inner=PID(kp=0.8, ki=9.0, kd=0.01, low=0.0, high=9.03, antiwindup=BackCalculation()))),
     "observer": balancing(controller=Sampled(controller=observer(), period=0.01)),
     "four phases": rig(FourPhase(torque_low=3.0, torque_high=9.0, rate=900.0)),
+    "two channels": tank(PerChannel({"pump_1": PID(kp=15.0, ki=400.0, low=0.0, high=9.0, antiwindup=Clamping()),
+        "pump_2": PID(kp=9.0, ki=200.0, kd=0.03, low=0.0, high=8.0)}, PUMPS)),
+    "the same gains": tank(PerChannel(PID(kp=9.0, ki=40.0, low=0.0, high=9.0), PUMPS),
+        reference=PerTarget(reference={"level_1": Setpoint(value=0.134), "level_2": Setpoint(value=0.127)})),
+    "least of two commands": tank(SelectLow(groups=(("pump_1", "pump_2"),),
+        controller=MatrixFeedback(gain=K, low=(0.0, 1.0), high=(9.0, 8.0), outputs_at_rest=(0.13, 0.12),
+        windup=np.zeros((2, 2)), states=("level_1", "level_2")))),
 }  # fmt: skip
 
 
@@ -87,6 +137,8 @@ def measured(loop, seed, lost=True):
     draw = np.random.default_rng(seed)
     if loop.plant.shows is BalanceOutput:
         found = BalanceOutput(*(0.3 * draw.normal(size=SAMPLES) for _ in BalanceOutput._fields))
+    elif hasattr(loop.plant, "controls"):
+        found = type(loop.plant.output(loop.start().plant))(*draw.uniform(0.0, 0.3, (4, SAMPLES)))
     else:
         speed = draw.uniform(0.5, 20.0, SAMPLES)
         slip = np.clip(0.2 + 0.15 * draw.normal(size=SAMPLES), 0.0, 1.0)
@@ -97,7 +149,8 @@ def measured(loop, seed, lost=True):
 
 
 def commands_of_parts(loop, seen, dtype, step=None):
-    """What the parts themselves command, sample by sample: reference, feed-forward, `Sampled`'s own tick."""
+    """What the parts themselves command, (SAMPLES,) or a column for each control: reference, feed-forward, `Sampled`'s
+    own tick."""
     with jax.enable_x64(dtype == np.float64):
         loop, seen = jax.tree.map(lambda x: jnp.asarray(x, dtype), (d.core.pytree.canonical_dtypes(loop), seen))
         h = loop.controller.period / (step or 1)
@@ -129,7 +182,8 @@ def commands_of_parts(loop, seen, dtype, step=None):
             memory = loop.controller.start(tracking(reference, first))
             return jax.lax.scan(sample, (reference, memory), (jnp.arange(SAMPLES), seen))[1]
 
-        return np.asarray(run())
+        commands = run()
+        return np.stack(commands, axis=-1) if isinstance(commands, tuple) else np.asarray(commands)
 
 
 def compiled(text, name, folder):
@@ -148,7 +202,7 @@ def commands_of_c(found, text, name, seen, folder):
     lines = "\n".join(" ".join(f"{value:.17g}" for value in row) for row in zip(*columns, strict=True))
     program = compiled(text, name, folder)
     said = subprocess.run([program], input=lines + "\n", capture_output=True, text=True, check=True).stdout
-    return np.array(said.split(), float)
+    return np.array([line.split() for line in said.splitlines()], float).squeeze()
 
 
 @pytest.mark.slow
@@ -176,13 +230,13 @@ def commands_of_c(found, text, name, seen, folder):
 @pytest.mark.parametrize("name", LOOPS)
 def test_what_is_exported_commands_what_the_parts_do(name, dtype, tmp_path):
     loop, seen = LOOPS[name], measured(LOOPS[name], seed=11)
-    step = 4 if name == "filtered target" else None
+    step = 4 if name in MOVING else None
     found = computer_program(loop, step=1e-3 / 4 if step else None, dtype=dtype)
     text = c_source(found, "unit")
     wanted = commands_of_parts(loop, seen, dtype, step)
     result = commands_of_c(found, text, "unit", seen, tmp_path)
     assert len(result) == SAMPLES
-    assert np.ptp(wanted) > 0
+    assert np.all(np.ptp(wanted, axis=0) > 0)
     tolerance = 1e-11 if dtype == np.float64 else 3e-3  # an integral over 10,000 samples gathers roundings
     np.testing.assert_allclose(result, wanted, rtol=tolerance, atol=tolerance * np.max(np.abs(wanted)))
     early = slice(0, 50)
@@ -271,7 +325,7 @@ def test_a_comment_ends_where_it_should(text, tmp_path):
             return self.k * signal.measured.slip
 
     found = computer_program(rig(Gain()))
-    found = dataclasses.replace(found, control_unit=text, units={name: text for name in found.units})
+    found = dataclasses.replace(found, commands={"command": text}, units={name: text for name in found.units})
     program = compiled(c_source(found, "unit", [text]), "unit", tmp_path)
     said = subprocess.run([program], input="0.5\n", capture_output=True, text=True, check=True).stdout
     assert float(said) == 1.5
@@ -400,6 +454,50 @@ def test_the_target_can_come_from_outside(tmp_path):
     assert "target; /* [1] */" in text
 
 
+@killed_by("output.export.lowered", "where == NUMBERS and isinstance", "where == INPUTS and isinstance")
+@killed_by("output.export.device", "outputs_like(measured, setpoint) if", "measured[0] if")
+@needs_cc
+def test_commands_and_targets_are_members_by_name(tmp_path):
+    """The quadruple tank's two PI controllers, the first of them at its limit, by hand."""
+    path = tmp_path / "tank.c"
+    command("export", "quadruple-tank", "--period", "0.5", "--given", "target", "-o", path)
+    text = path.read_text()
+    for member in ("level_2; /* [m] */", "target_level_2; /* [m] */", "pump_2; /* [V] */", "pump_1_kp; /* [V/m] in"):
+        assert f"  tank_real {member}" in text
+    assert "  tank_real pump_1; /* [V] */\n  tank_real pump_2; /* [V] */\n} tank_command;" in text
+    program = compiled(text, "tank", tmp_path)
+    order = re.findall(r"tank_real (\w+);", text.partition("} tank_input")[0])
+    values = {"level_1": 0.10, "level_2": 0.13, "target_level_1": 0.2, "target_level_2": 0.12}
+    line = " ".join(str(values[name]) for name in order)
+    said = subprocess.run([program], input=f"{line}\n" * 2, capture_output=True, text=True, check=True).stdout
+    plant = QuadrupleTank()
+    pumps = plant.holding(None, collections.namedtuple("Target", ["level_1", "level_2"])(0.2, 0.12))
+    first = float(pumps.pump_2) - 135.0 * 0.01
+    wanted = [[10.0, first], [10.0, first - 3.375 * 0.5 * 0.01]]
+    np.testing.assert_allclose([[*map(float, row.split())] for row in said.splitlines()], wanted, rtol=1e-6)
+
+
+def test_a_control_may_have_the_name_of_a_field_of_memory():
+    """Controls called flow and held, words that other names of memory lack."""
+    state = computer_program(LOOPS["two channels"]).state
+    state = state._replace(command=collections.namedtuple("Valves", ["flow", "held"])(*state.command))
+    names = number_leaves(state, Labelled(), MEMORY, name_memory)
+    assert {"command.flow", "command.held", "controller.pump_1.integral"} < {*names}
+
+
+def test_difference_equations_of_two_channels():
+    found = difference_equations(sample_controller(load("quadruple-tank").loop, 0.5))
+    levels, pumps = ("level_1", "level_2"), ("pump_1", "pump_2")
+    assert found["inputs"] == [
+        *(f"target.{name}" for name in levels),
+        *levels,
+        *(f"feedforward.{name}" for name in pumps),
+    ]
+    np.testing.assert_allclose(found["H"], [[5.0, 0.0, 0.0, 0.0], [0.0, 0.0, 3.375, 0.0]], rtol=1e-12)
+    rows = [[150.0, 0.0, -150.0, 0.0, 1.0, 0.0], [0.0, 135.0, 0.0, -135.0, 0.0, 1.0]]
+    np.testing.assert_allclose(found["J"], rows, rtol=1e-12)
+
+
 @pytest.mark.slow
 @killed_by("output.export.difference_equations", "with jax.enable_x64(True):", "if True:")
 @killed_by("output.export.difference_equations", "jax.tree.map(lambda x: jnp.asarray(x, float), loop)", "loop")
@@ -486,7 +584,10 @@ def test_the_command_writes_a_file_that_compiles(tmp_path):
         (["slip-lmi", "--to", "fmu", "--float32"], "are for --to c and --to st"),
         (["slip-cured", "--to", "table"], "table"),
         (["slip-cured", "--to", "fortran"], "fortran"),
-        (["lab-rig-measured"], "80 steps of the solver, more than 64: choose a solver.step of at least 0.00015625 s"),
+        (
+            ["lab-rig-measured", "--set", 'reference={type="filtered-slip"}'],
+            "80 steps of the solver, more than 64: choose a solver.step of at least 0.00015625 s",
+        ),
     ],
 )
 def test_the_command_refuses_in_one_line(arguments, words, tmp_path):
@@ -689,7 +790,7 @@ def commands_of_text(text, seen):
     return np.array([block(**dict(zip(names, row, strict=True))) for row in zip(*columns, strict=True)], float)
 
 
-WITH_MUTANTS = {"conditional integration", "PID, filtered derivative", "filtered target"}
+WITH_MUTANTS = {"conditional integration", "PID, filtered derivative", "filtered target", "two channels"}
 
 
 @killed_by(
@@ -712,11 +813,11 @@ WITH_MUTANTS = {"conditional integration", "PID, filtered derivative", "filtered
 def test_structured_text_commands_what_the_parts_do(name, dtype):
     """Over 10,000 samples to rounding: an integral gathers some, in single precision as much as C does."""
     loop, seen = LOOPS[name], measured(LOOPS[name], seed=11)
-    step = 4 if name == "filtered target" else None
+    step = 4 if name in MOVING else None
     found = computer_program(loop, step=1e-3 / 4 if step else None, dtype=dtype)
     result = commands_of_text(structured_text(found, "Unit"), seen)
     wanted = commands_of_parts(loop, seen, dtype, step)
-    assert np.ptp(wanted) > 0
+    assert np.all(np.ptp(wanted, axis=0) > 0)
     tolerance = 1e-11 if dtype == np.float64 else 3e-3
     np.testing.assert_allclose(result, wanted, rtol=tolerance, atol=tolerance * np.max(np.abs(wanted)))
     early = slice(0, 50)

@@ -23,7 +23,7 @@ class Block:
 
     def __init__(self, text: str):
         self.tokens = self._tokens(re.sub(r"\(\*.*?\*\)", " ", text, flags=re.DOTALL))
-        self.at, self.types, self.values, self.inputs = 0, {}, {}, []
+        self.at, self.types, self.values, self.inputs, self.outputs = 0, {}, {}, [], []
         self._take("FUNCTION_BLOCK")
         self.name = self._next()
         while self._peek() in ("VAR", "VAR_INPUT", "VAR_OUTPUT", "VAR_TEMP"):
@@ -42,7 +42,8 @@ class Block:
             self.values[name.upper()] = REALS.get(self.types[name.upper()], bool)(value)
         with np.errstate(all="ignore"):
             self._run(self.values)
-        return self.values["COMMAND"]
+        commands = [self.values[name] for name in self.outputs if name != "HELD"]
+        return commands[0] if self.outputs[0] == "COMMAND" else commands
 
     @staticmethod
     def _tokens(text):
@@ -89,6 +90,7 @@ class Block:
                 self.types[name] = kind if size is None else (kind, size)
                 self.values[name] = zero if size is None else [zero] * size
             self.inputs += names if section == "VAR_INPUT" else []
+            self.outputs += names if section == "VAR_OUTPUT" else []
         self._next()
 
     def _initial(self, kind):

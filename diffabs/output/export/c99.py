@@ -27,10 +27,10 @@ def c_source(device: ComputerProgram, name: str, notes: Sequence[str] = ()) -> s
     """Return the text of a C99 file that runs a controller.
 
     The file has the number type `NAME_real`, the structs `NAME_state`, `NAME_input` and `NAME_parameters` with
-    `NAME_defaults`, and the functions `NAME_start` and `NAME_step`. `NAME_step` returns the command. The structs hold
-    only the inputs, parameters and memory that the command depends on. Under `#ifdef NAME_MAIN`, with the name in
-    capitals, it has a main function for tests. That function reads a line of inputs for each sample from standard input
-    and writes a line with the command.
+    `NAME_defaults`, and the functions `NAME_start` and `NAME_step`. `NAME_step` returns the command, or with several
+    controls the struct `NAME_command`. The structs hold only the inputs, parameters and memory that a command depends
+    on. Under `#ifdef NAME_MAIN`, with the name in capitals, it has a main function for tests. That function reads a
+    line of inputs for each sample from standard input and writes a line with the commands.
 
     Args:
         device: The computer's part of a loop.
@@ -61,6 +61,10 @@ class _Text:
             where: identifiers(paths)
             for where, paths in ((INPUTS, program.read), (MEMORY, [*program.memory, "held"]), (NUMBERS, program.used))
         }
+        # Members of the struct of commands; a single command has no struct.
+        several = identifiers(path.removeprefix("command.") for path in device.commands if path != "command")
+        self.members = list(several.values())
+        self.returned = f"{name}_command" if several else self.real
         self.words = Words(self.real, self._place, single=device.dtype == np.float32)
 
     def _place(self, where: str, path: str) -> str:
@@ -73,15 +77,17 @@ class _Text:
         yield f"typedef {'float' if self.device.dtype == np.float32 else 'double'} {self.real};\n"
         yield from self._structs()
         arguments = f"{self.name}_state *s, const {self.name}_parameters *p, const {self.name}_input *in"
-        start, step = f"void {self.name}_start({arguments})", f"{self.real} {self.name}_step({arguments})"
+        start, step = f"void {self.name}_start({arguments})", f"{self.returned} {self.name}_step({arguments})"
         yield f"{start};\n{step};\n"
         yield from self._defaults()
         yield f"/* Before the first sample, with what is measured then. */\n{start}\n{{"
         yield from self._body(self.program.begun, ())
         yield "  s->held = false;\n}\n"
-        yield f"/* At each sample: the command [{comment_text(self.device.control_unit)}]. */\n{step}\n{{"
+        units = ", ".join(self.device.commands.values())
+        yield f"/* At each sample: the command{'s' * bool(self.members)} [{comment_text(units)}]. */\n{step}\n{{"
         yield from self._body(self.program.stored, [self.program.held])
-        yield "  return s->command;\n}\n"
+        held = ", ".join(f"s->{self.fields[MEMORY][path]}" for path in self.device.commands)
+        yield f"  return {f'({self.returned}){{{held}}}' if self.members else held};\n}}\n"
         yield from self._main()
 
     def _head(self) -> Iterator[str]:
@@ -113,6 +119,10 @@ class _Text:
         yield from self._struct("What can be changed, also between two samples.", "parameters", used)
         declarations = [f"{self.words.type(program.state[x])} {memory[x]};" for x in program.memory]
         held = f"bool {memory['held']}; /* whether the last sample could not be used */"
+        if self.members:
+            units = self.device.commands.values()
+            rows = [f"{real} {x}; /* [{comment_text(unit)}] */" for x, unit in zip(self.members, units, strict=True)]
+            yield from self._struct("What the controller commands.", "command", rows)
         yield from self._struct("What is remembered from one sample to the next.", "state", [*declarations, held])
 
     def _struct(self, about: str, name: str, members: Sequence[str]) -> Iterator[str]:
@@ -171,5 +181,12 @@ class _Text:
         yield f"    if (first)\n      {self.name}_start(&s, &{self.name}_defaults, &in);"
         yield "    first = false;"
         # Seventeen digits identify a double.
-        yield f'    printf("%.17g\\n", (double){self.name}_step(&s, &{self.name}_defaults, &in));\n  }}'
+        step, printed = (
+            f"{self.name}_step(&s, &{self.name}_defaults, &in)",
+            " ".join(["%.17g"] * max(len(self.members), 1)),
+        )
+        if self.members:
+            yield f"    const {self.returned} u = {step};"
+        values = ", ".join(f"(double)u.{member}" for member in self.members) or f"(double){step}"
+        yield f'    printf("{printed}\\n", {values});\n  }}'
         yield "  return 0;\n}\n#endif"

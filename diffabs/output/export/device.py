@@ -1,6 +1,6 @@
-"""The computer's part of a loop: the calculation from measurements to command that runs once a period.
+"""The computer's part of a loop: the calculation from measurements to commands that runs once a period.
 
-    memory, measured --> target, feed-forward, controller --> memory, command
+    memory, measured --> target, feed-forward, controller --> memory, commands
 
 The functions are the loop's own code, traced: reference, feed-forward and the controller within `Sampled`
 (`Sampled.compute_guarded`). The parameters of these three remain variables. Those of the plant, period and delay become
@@ -19,11 +19,12 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from diffabs.core.blocks import offers
+from diffabs.core.channels import has_channels, outputs_like
 from diffabs.core.protocols import Clock, Feedforward, Memory, Tracking
 from diffabs.core.pytree import ParameterSpec, arrays, parameters, prepare_parts
 from diffabs.core.tracing import depends_on_signal, leaf_dependence
 from diffabs.core.types import Part, PyTree, Scalar
-from diffabs.core.units import unit_at
+from diffabs.core.units import control_units, unit_at
 from diffabs.core.validity import find_problems
 from diffabs.engine.step.runge_kutta import rk4_step
 from diffabs.loop.closed_loop import Loop
@@ -42,7 +43,7 @@ class Input(NamedTuple):
 
     Attributes:
         measured: Measured outputs, a tuple such as `BrakeOutput`.
-        target: Target in the unit of the plant's first output, if it comes from outside; else empty.
+        target: Target, a number or a channel for each output with a target, if it comes from outside; else empty.
     """
 
     measured: PyTree
@@ -55,13 +56,13 @@ class State(NamedTuple):
     Attributes:
         controller: Memory of the controller.
         samples: Number of samples so far (int64).
-        command: Last command, in the unit of the control.
+        command: Last command, a number or a channel for each control.
         reference: Memory of the reference, empty if the target comes from outside.
     """
 
     controller: Memory
     samples: PyTree
-    command: Scalar
+    command: PyTree
     reference: Memory
 
 
@@ -123,7 +124,7 @@ class ComputerProgram:
         dtype: Type of the real numbers.
         period: Sampling period [s].
         delay: Computing delay [s].
-        control_unit: Unit of the command.
+        commands: Unit of each command by its name in `Lowered.state`: command, or command.pump_1.
         numbers: All parameters; those of the plant only if the feed-forward depends on them.
     """
 
@@ -138,7 +139,7 @@ class ComputerProgram:
     dtype: np.dtype
     period: float
     delay: float
-    control_unit: str
+    commands: dict[str, str]
     numbers: tuple[DeviceParameter, ...]
 
 
@@ -157,16 +158,14 @@ def computer_program(
     Raises:
         ValueError: The step is not positive and finite, or the type is neither float32 nor float64.
         NotExported: A parameter is no number or has a wrong value or shape, the controller runs in continuous time,
-            the plant has several inputs, or a period has more than MAX_STEPS_PER_SAMPLE steps. Without `given_target`,
-            also a reference that follows measurements, ticks or has events.
+            or a target that moves by itself needs more than MAX_STEPS_PER_SAMPLE steps in a period. Without
+            `given_target`, also a reference that follows measurements, ticks or has events.
     """
     if step is not None and not 0 < step < np.inf:
         raise ValueError(f"step = {step:g} s: a positive and finite number is needed")
     if np.dtype(dtype) not in (np.float32, np.float64):
         raise ValueError(f"dtype = {np.dtype(dtype)}: float32 or float64 is needed")
     check_numbers(loop)
-    if hasattr(loop.plant, "controls"):
-        raise NotExported("a program for a computer has one command; build the FMU of a plant with several inputs")
     loop = with_sampled_controller(loop)
     controller: Part = loop.controller
     with jax.enable_x64(True):
@@ -180,34 +179,36 @@ def computer_program(
             _check_reference(typed, _start_input(typed, False).measured)
         period = float(controller.period)
         count = max(round(period / step) if step else 1, 1)
-        if count > MAX_STEPS_PER_SAMPLE:
-            raise NotExported(
-                f"the period of {period:g} s is {count} steps of the solver, more than {MAX_STEPS_PER_SAMPLE}: choose a"
-                f" solver.step of at least {period / MAX_STEPS_PER_SAMPLE:g} s"
-            )
         work = _Work(typed, count, given_target, shapes)
         state = jax.eval_shape(work.start, parts, shapes)
+        moves = count if jax.tree.leaves(state.reference.flow) else 0
+        if moves > MAX_STEPS_PER_SAMPLE:
+            raise NotExported(
+                f"the period of {period:g} s is {moves} steps of the solver, more than {MAX_STEPS_PER_SAMPLE}: choose a"
+                f" solver.step of at least {period / MAX_STEPS_PER_SAMPLE:g} s"
+            )
     units = dict(loop.plant.shows.units)
     if given_target:
-        units["target"] = units[loop.plant.shows._fields[0]]
-    moves = count if jax.tree.leaves(state.reference.flow) else 0
+        names = getattr(shapes.target, "_fields", ())
+        units |= {f"target.{name}": units[name] for name in names} or {"target": units[loop.plant.shows._fields[0]]}
+    controls = control_units(loop.plant)
+    commands = {f"command.{name}" if has_channels(state.command) else "command": controls[name] for name in controls}
     return ComputerProgram(
         work.start, work.step, work.move, moves, units, shapes, state, parts, np.dtype(dtype), period,
-        float(controller.delay), loop.plant.control_unit,
-        tuple(_numbers(loop, typed, shapes, given_target)),
+        float(controller.delay), commands, tuple(_numbers(loop, typed, given_target)),
     )  # fmt: skip
 
 
-def _numbers(loop: Loop, typed: Loop, inputs: Input, given_target: bool) -> Iterator[DeviceParameter]:
+def _numbers(loop: Loop, typed: Loop, given_target: bool) -> Iterator[DeviceParameter]:
     """Yield the parameters that the computer's calculation depends on."""
-    measured = inputs.measured
 
     def ahead(plant: object) -> Scalar:
-        return typed.feedforward.input(plant, measured, measured[0])
+        return typed.feedforward.input(plant, measured, target)
 
     families = ["controller", "feedforward", *(() if given_target else ("reference",))]
     with jax.enable_x64(True):
-        measured = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), measured)
+        shapes = jax.eval_shape(lambda: _start_input(typed, True))
+        measured, target = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         families += ["plant"] if depends_on_signal(ahead, typed.plant) else []
     for path, spec, value in parameters(loop):
         if path.partition(".")[0] in families:
@@ -232,11 +233,12 @@ def with_sampled_controller(loop: Loop) -> Loop:
     return dataclasses.replace(loop, controller=controller)
 
 
-def _start_input(loop: Loop, target: bool) -> Input:
-    """Return the input at the loop's start."""
+def _start_input(loop: Loop, given_target: bool) -> Input:
+    """Return the input at the loop's start, whose target is what is measured."""
     state = loop.start()
     measured = loop.sensor.output(0.0, state.sensor, loop.plant.output(state.plant))
-    return Input(measured, measured[0] if target else ())
+    setpoint = loop.reference.setpoint(loop.reference.start(measured))
+    return Input(measured, outputs_like(measured, setpoint) if given_target else ())
 
 
 def _check_reference(loop: Loop, measured: object) -> None:
@@ -261,7 +263,7 @@ class _Work:
         loop, inputs = self._with(parts), replace_nan(inputs)
         reference = Memory() if self.given_target else loop.reference.start(inputs.measured)
         tracking, _ = self._track(loop, reference, inputs, 0.0)
-        zero = jnp.zeros_like(tracking.target)
+        zero = jax.tree.map(jnp.zeros_like, tracking.feedforward)
         return State(loop.controller.controller.start(tracking), jnp.zeros((), jnp.int64), zero, reference)
 
     def step(self, parts: Parts, state: State, inputs: Input) -> tuple[Memory, PyTree, PyTree, PyTree]:

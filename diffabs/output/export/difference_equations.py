@@ -1,10 +1,13 @@
 """A sampled controller as linear difference equations, valid while no limit is active."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.types import AnyArray, JsonObject, Scalar
+from diffabs.core.channels import has_channels
+from diffabs.core.types import AnyArray, JsonObject, PyTree, Scalar
 from diffabs.linear.opened_loop import linear_controller
 from diffabs.loop.closed_loop import Loop
 from diffabs.output.export.device import NotExported, check_numbers, with_sampled_controller
@@ -25,7 +28,8 @@ def difference_equations(loop: Loop, target: Scalar | None = None) -> JsonObject
 
     Returns:
         A dictionary with lists "F" (n, n), "G" (n, m), "H" (n,), "J" (m,), the m names of y as "inputs", and the
-        "period" [s].
+        "period" [s]. With several controls H and J have a row for each, and "target" and "feedforward" are names such
+        as "target.level_1".
 
     Raises:
         NotExported: A parameter is no number or has a wrong value or shape, the controller runs in continuous time, or
@@ -39,14 +43,25 @@ def difference_equations(loop: Loop, target: Scalar | None = None) -> JsonObject
     except ValueError as error:
         raise NotExported(str(error)) from None
     controller = controller._replace(**{name: _round_entries(getattr(controller, name)) for name in "ABCD"})
-    names = ["target", *loop.plant.shows._fields, "feedforward"]
+    start = jax.eval_shape(lambda: loop.signals(0.0, loop.start()).tracking)
+    names = [*_names("target", start.target), *loop.plant.shows._fields, *_names("feedforward", start.feedforward)]
     # Inputs without any coefficient are left out, such as an unused feed-forward.
-    used = (np.abs(controller.B).max(axis=0, initial=0) > 0) | (np.abs(controller.D[0]) > 0)
+    used = np.abs(np.vstack([controller.B, controller.D])).max(axis=0) > 0
     columns = [i for i, is_used in enumerate(used) if is_used]
     return {
         "period": controller.period, "inputs": [names[i] for i in columns], "F": controller.A.tolist(),
-        "G": controller.B[:, columns].tolist(), "H": controller.C[0].tolist(), "J": controller.D[0, columns].tolist(),
+        "G": controller.B[:, columns].tolist(), "H": _rows(controller.C), "J": _rows(controller.D[:, columns]),
     }  # fmt: skip
+
+
+def _names(name: str, signal: PyTree) -> list[str]:
+    """Return the names of a signal's channels, or its own for a signal with one."""
+    return [f"{name}.{channel}" for channel in signal._fields] if has_channels(signal) else [name]
+
+
+def _rows(matrix: np.ndarray) -> list[Any]:
+    """Return the rows of a matrix, or the only one."""
+    return matrix.tolist() if len(matrix) > 1 else matrix[0].tolist()
 
 
 def _round_entries(matrix: AnyArray) -> np.ndarray:

@@ -30,9 +30,8 @@ class Lowered:
         after: Nodes of the memory after a sample, by name.
         moving: Nodes of the reference's memory after one simulation step, by name; they repeat `moves` times a sample.
         place: Node of the counter of these steps.
-        command: Node of the command.
         held: Boolean node: the sample cannot be used.
-        memory: Names of the memory that the command or `held` depends on, at once or later, and "command" itself.
+        memory: Names of the memory that a command or `held` depends on, at once or later, and those of the commands.
         read: Names of the inputs that this memory or `held` depends on.
         used: Names of the parameters that this memory or `held` depends on.
         stored: Nodes of the memory after a sample for the names in `memory`, without `moving`.
@@ -48,10 +47,7 @@ class Lowered:
         self.numbers: dict[str, Node] = number_leaves(
             device.parts, graph, NUMBERS, lambda path: path.removeprefix("controller.")
         )
-        # The field names flow and held in a memory path tell a reader nothing.
-        self.state: dict[str, Node] = number_leaves(
-            device.state, graph, MEMORY, lambda path: re.sub(r"\.(flow|held)(?=\.|$)", "", path)
-        )
+        self.state: dict[str, Node] = number_leaves(device.state, graph, MEMORY, name_memory)
         values = [float(x) for leaf in jax.tree.leaves(device.parts) for x in np.asarray(leaf, float).flat]
         self.values: dict[str, float] = dict(zip(self.numbers, values, strict=True))
         inputs, parts = fill_shapes(device.input, self.inputs), fill_shapes(device.parts, self.numbers)
@@ -70,7 +66,6 @@ class Lowered:
         # The reference's memory comes last in the state, and only `move` changes it.
         moving = dict(zip([*self.state][len(after) :], moved, strict=bool(moved)))
         self.after: dict[str, Node] = dict(zip(self.state, after, strict=False)) | moving
-        self.command: Node = self.after["command"]
         self.memory: list[str] = self._find_memory()
         self.moving: dict[str, Node] = {name: node for name, node in moving.items() if name in self.memory}
         self.begun: dict[str, Node] = {
@@ -85,18 +80,27 @@ class Lowered:
         self.used: list[str] = [name for name, node in self.numbers.items() if node.id in live]
 
     def _find_memory(self) -> list[str]:
-        """Return the names of the memory that the command depends on, from one sample to the next."""
-        names = {"command"}
-        roots = [self.command, self.held]
+        """Return the names of the memory that the commands depend on, from one sample to the next."""
+        names = set(self.device.commands)
         while True:
+            roots = [self.held, *(self.after[name] for name in names if name in self.after)]
             needed = {node.id for node in live_nodes(roots)}
-            # A fixed point: memory that the command reads depends on further memory one sample earlier.
+            # A fixed point: memory that a command reads depends on further memory one sample earlier.
             more = {name for name, node in self.state.items() if node.id in needed} - names
             if not more:
                 break
             names |= more
-            roots = [self.command, self.held, *(self.after[name] for name in names if name in self.after)]
         return [name for name in self.state if name in names]
+
+
+def name_memory(path: str) -> str:
+    """Return a name for a number of the memory: the field names flow and held tell a reader nothing."""
+    return path if path.startswith("command") else re.sub(r"\.(flow|held)(?=\.|$)", "", path)
+
+
+def _holds_parts(where: str, after: object) -> bool:
+    """Return whether a field holds parts by name, whose paths lack the field; `after` is the next key of a path."""
+    return where == NUMBERS and isinstance(after, jax.tree_util.DictKey)
 
 
 def number_leaves(shape: object, graph: Graph, where: str, flat: PyTree) -> dict[str, Node]:
@@ -109,7 +113,8 @@ def number_leaves(shape: object, graph: Graph, where: str, flat: PyTree) -> dict
     """
     nodes: dict[str, Node] = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(shape):
-        words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
+        keys = [key for key, after in zip(path, [*path[1:], None], strict=True) if not _holds_parts(where, after)]
+        words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in keys]
         for at in np.ndindex(leaf.shape):
             full = ".".join([*words, *map(str, at)])
             name = flat(full) if flat(full) not in nodes else full

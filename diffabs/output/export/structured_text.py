@@ -42,9 +42,10 @@ OWN = {"command", "held", "reset", "started", "i"}  # names that the block itsel
 def structured_text(device: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
     """Return the text of a FUNCTION_BLOCK that runs a controller.
 
-    Its inputs are `reset` and the measurements that the controller reads. Its outputs are `command` and `held`, which
-    is true if the sample could not be used. The parameters are variables of the block. Call the block once a period.
-    It starts at its first call, and again whenever `reset` is true.
+    Its inputs are `reset` and the measurements that the controller reads. Its outputs are `command`, or one such as
+    `command_pump_1` for each control, and `held`, which is true if the sample could not be used. The parameters are
+    variables of the block. Call the block once a period. It starts at its first call, and again whenever `reset` is
+    true.
 
     Args:
         device: The computer's part of a loop.
@@ -71,11 +72,12 @@ class _Block:
         self.device, self.name, self.notes = device, name, notes
         self.program = program = Lowered(device)
         self.real = "REAL" if device.dtype == np.float32 else "LREAL"
-        self.used_names = used_names = OWN | {name.lower()}
-        self.names = {(INPUTS, path): _fresh(path, used_names) for path in program.read}
+        self.used_names = used_names = OWN - {*device.commands} | {name.lower()}
+        self.names = {(MEMORY, path): _fresh(path, used_names) for path in device.commands}
+        self.names |= {(INPUTS, path): _fresh(path, used_names) for path in program.read}
         self.names |= {(NUMBERS, path): _fresh(path, used_names) for path in program.used}
-        self.names |= {(MEMORY, path): _fresh(f"m_{path}", used_names) for path in program.memory if path != "command"}
-        self.names[MEMORY, "command"] = "command"
+        memory = [path for path in program.memory if path not in device.commands]
+        self.names |= {(MEMORY, path): _fresh(f"m_{path}", used_names) for path in memory}
         self.temporary: dict[str, str] = {}  # types by name
         self.called: dict[int, str] = {}  # variables by the id of the node
 
@@ -89,13 +91,15 @@ class _Block:
         for path in program.read:
             yield f"  {self.names[INPUTS, path]} : {self.real}; (* [{comment_text(units.get(path, '1'))}] *)"
         yield "  reset : BOOL; (* begin anew, with what is measured now *)\nEND_VAR"
-        yield f"VAR_OUTPUT\n  command : {self.real}; (* [{comment_text(self.device.control_unit)}] *)"
+        yield "VAR_OUTPUT"
+        for path, unit in self.device.commands.items():
+            yield f"  {self.names[MEMORY, path]} : {self.real}; (* [{comment_text(unit)}] *)"
         yield "  held : BOOL; (* whether the last sample could not be used *)\nEND_VAR"
         if program.used:
             yield from ["VAR (* parameters *)", *self._parameters(), "END_VAR"]
         yield "VAR"
         for path in program.memory:
-            if path != "command":
+            if path not in self.device.commands:
                 yield f"  {self.names[MEMORY, path]} : {self._type(program.state[path])};"
         yield "  started : BOOL := FALSE;\nEND_VAR"
         if self.temporary:
@@ -142,7 +146,7 @@ class _Block:
         yield from self._assign(program.stored, [program.held], "")
 
     def _assign(self, stored: dict[str, Node], more: Sequence[Node], indent: str) -> Iterator[str]:
-        """Yield the operations that these nodes need, then assignments to the command and the memory."""
+        """Yield the operations that these nodes need, then assignments to the commands and the memory."""
         yield from self._operations(live_nodes([*stored.values(), *more]), indent)
         for node in more:
             yield f"{indent}held := {self._value(node)};"
