@@ -272,6 +272,10 @@ def _with_named_parts(part: Any, table: JsonObject, family: str, path: str, unit
     old, inner = getattr(part, field.name), family_of(field.name, family)
     parts = dict(old) if isinstance(old, dict) else {}
     for name, section in table.items():
+        if old and name not in parts and type_name(section) is None:
+            names = [*parts, *(other.name for other in dataclasses.fields(part) if other is not field)]
+            error = unknown_name_error(f"{join_path(path, name)} is no part of {name_of(family, part)}", name, names)
+            raise ScenarioError(f"{error}; a new part needs a type")
         units_there = units_inside(part, name, units)
         parts[name] = build_part(inner, section, parts.get(name), join_path(path, name), units_there)
     return dataclasses.replace(part, **{field.name: parts})

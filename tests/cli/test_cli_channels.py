@@ -9,6 +9,8 @@ from commands import assert_one_error_line, run
 from mutants import killed_by
 from project import ROOT
 
+from diffabs.loop.batch import Batch
+from diffabs.loop.ensemble import run_batch
 from diffabs.scenario import outside
 from diffabs.scenario.scenario import dump, load, loads
 
@@ -52,6 +54,22 @@ def test_tune_and_sweep(tmp_path):
     assert {"overshoot_1", "iae"} < summary["metrics"].keys()
 
 
+@pytest.mark.slow
+def test_a_rare_failure_of_one_channel():
+    """About one pair of valve settings in 180, as the runs of a grid of pairs show it."""
+    words = ("overshoot_1=0.33", "--samples", 400, "--seed", 3, "--json")
+    result = json.loads(run("rare", HERE / "tank.toml", *words).stdout)
+    assert len(result["levels"]) > 1
+    chosen, n = load(HERE / "tank.toml"), 60
+    places = 0.1 * (np.arange(n) + 0.5) / n
+    shares = [x.ravel() for x in np.meshgrid(0.65 + places, 0.55 + places)]
+    batch = Batch(dict(zip(("plant.share_1", "plant.share_2"), shares, strict=True)))
+    runs = run_batch(chosen.loop, batch, chosen.solver, {"overshoot": chosen.objectives["overshoot_1"]})
+    share = float(np.mean(np.asarray(runs.metrics["overshoot"]) > 0.33))
+    low, high = result["interval"]
+    assert low < share < high < 4 * share
+
+
 REFUSED = {
     "a channel of no output": (
         ["simulate", "quadruple-tank", "--set", "controller.channels.pump_1=level_9"],
@@ -61,6 +79,14 @@ REFUSED = {
     "a controller without a channel": (
         ["simulate", "quadruple-tank", "--set", "controller.pump_3=pid"],
         "there are controllers of pump_1, pump_2, pump_3",
+    ),
+    "a misspelt channel": (
+        ["simulate", "quadruple-tank", "--set", "controller.pump_9.kp=3"],
+        "controller.pump_9 is no part of per-channel; did you mean pump_2? There is pump_1, pump_2, channels",
+    ),
+    "a number of a channel out of range": (
+        ["simulate", "quadruple-tank", "--set", "controller.pump_1.cutoff=-3"],
+        "controller.pump_1.cutoff = -3 is outside (0, inf) rad/s",
     ),
     "a proof": (["certify", "quadruple-tank"], "needs a loop with one control; plant QuadrupleTank has pump_1, pump_2"),
 }
