@@ -12,6 +12,7 @@ from mutants import killed_by
 from scipy.optimize import brentq
 
 import diffabs as d
+from diffabs import controllers, references
 from diffabs.core.pytree import get, replace
 from diffabs.engine.solve import SolutionStatus
 from diffabs.engine.step import fixed, slides
@@ -226,6 +227,35 @@ def test_a_wave_that_switches_during_a_slide_is_no_surface_to_slide_along(step):
     for width in (1e-3, 1e-4, 1e-5):
         ends = [[exact_wave_integral(p + side * width) for side in (-1, 1)] for p in frequencies]
         np.testing.assert_allclose(slopes, np.diff(ends)[:, 0] / (2 * width), rtol=1e-6)
+
+
+def sampled_square(friction):
+    """Return the integral of the square of the speed: constant accelerations between ticks, until friction holds."""
+    speed, total = 1.0, 0.0
+    while speed > 0:
+        rate = 2.0 * (0.1 - speed) - friction
+        length = min(0.25, -speed / rate)
+        total += speed**2 * length + speed * rate * length**2 + rate**2 * length**3 / 3
+        speed = speed + rate * length if length == 0.25 else 0.0
+    return total
+
+
+@killed_by("engine.step.advance", "& request.strikes & ticks", "& request.strikes")
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_slide_goes_on_between_the_ticks_of_a_clock(solver):
+    controller = controllers.Sampled(controller=controllers.PID(kp=2.0, cutoff=3.0), period=0.25, delay=0.0)
+    loop = test_slides.loop_of(sliding.Block(), controller=controller, reference=references.Setpoint(value=0.1))
+
+    def square(friction):
+        run = d.measure(replace(loop, {"plant.Fc": friction}), solver, {"square": test_slides.Square()})
+        return run.metrics["square"], run.slid
+
+    value, slope, slid = jax.jvp(square, (0.7,), (1.0,), has_aux=True)
+    assert not slid
+    np.testing.assert_allclose(value, sampled_square(0.7), rtol=1e-7)
+    for width in (1e-3, 3e-4, 1e-4):
+        difference = (sampled_square(0.7 + width) - sampled_square(0.7 - width)) / (2 * width)
+        np.testing.assert_allclose(slope, difference, rtol=1e-5)
 
 
 @killed_by("engine.step.slides", "strays |= jnp.any(", "strays &= jnp.any(", case="FIXED")

@@ -239,7 +239,7 @@ def advance(
 
     slides = carry.slides
     if slides:
-        slides = _watch_slides(stepping, hybrid.ticks, carry, attempt, decision, request)
+        slides = _watch_slides(stepping, hybrid, carry, attempt, decision, request)
         mode = decision.mode
         if slides.followed:  # a slide begins in the mode of the step: either side's mode serves
             words = select(begins_along(carry.slides, slides), attempt.point.words, mode.words)
@@ -273,14 +273,15 @@ def advance(
 
 
 def _watch_slides(
-    stepping: Stepping, ticks: bool, carry: Carry, attempt: Attempt, decision: Decision, request: StepRequest
+    stepping: Stepping, hybrid: HybridSystem, carry: Carry, attempt: Attempt, decision: Decision, request: StepRequest
 ) -> SlideWatch:
     """Return the watch for slides after an attempt."""
     regular = carry.status == RunStatus.RUNNING
     calm = decision.accepted & stepping.is_calm(carry) & (regular | decision.crosses_surface)
     reset = reduce(jnp.logical_or, jax.tree.leaves(decision.triggered))
-    if ticks:  # a block may have changed
-        reset |= decision.accepted & request.strikes
+    if hybrid.ticks:  # a block may have changed; fixed steps strike at every instant of the grid
+        ticks = hybrid.next_tick(carry.k, request.grid) <= request.strike
+        reset |= decision.accepted & request.strikes & ticks
     landed, words, t = decision.crosses_surface, carry.point.words, attempt.point.t
     return watch_landing(carry.slides, Landing(carry.search, words, landed, calm, reset, t))
 
