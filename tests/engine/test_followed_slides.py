@@ -258,6 +258,25 @@ def test_a_slide_goes_on_between_the_ticks_of_a_clock(solver):
         np.testing.assert_allclose(slope, difference, rtol=1e-5)
 
 
+@killed_by("engine.step.outlook", "(read_bits(ended.answers, numbers)", "(False & read_bits(ended.answers, numbers)")
+@pytest.mark.parametrize("solver", [d.FixedStep(5e-3, END, follow_slides=True), SOLVERS[1]])
+def test_a_run_leaves_a_surface_that_two_comparisons_share(solver):
+    """A growing force leaves friction with rate 0: rounding gave the other comparison of the sign a turn."""
+
+    def push(t, y, p):
+        slope, friction = p
+        return slope * t - friction * jnp.sign(y)
+
+    def end(p):
+        solution = d.solve(push, jnp.array([0.2]), 0.0, END, p, solver=solver, engine="xla")
+        return solution.y[0], solution.status
+
+    slopes, frictions = 0.6 + jnp.linspace(-0.05, 0.05, 24), 1.0 + 0.03 * jnp.sin(jnp.arange(24.0))
+    ends, statuses = jax.vmap(end)((slopes, frictions))
+    assert not statuses.any()
+    np.testing.assert_allclose(ends, slopes * (END - frictions / slopes) ** 2 / 2, rtol=1e-8)
+
+
 @killed_by("engine.step.slides", "strays |= jnp.any(", "strays &= jnp.any(", case="FIXED")
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_two_surfaces_met_at_one_instant_are_no_single_one(solver):

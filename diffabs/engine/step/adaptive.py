@@ -36,7 +36,7 @@ from diffabs.engine.step.attempt import Attempt, Point, StepRequest
 from diffabs.engine.step.event_location import RunStatus
 from diffabs.engine.step.modes import SurfaceCrossing
 from diffabs.engine.step.runge_kutta import TSIT5, midpoint_error
-from diffabs.engine.step.slides import along_of, begin_slide, ended_slide
+from diffabs.engine.step.slides import along_of, begin_slide, ended_slide, no_surface
 from diffabs.engine.step.step_size import (
     INITIAL_STEP_S,
     MIN_LOCATION_FRACTION,
@@ -197,7 +197,7 @@ class AdaptiveStepping:
     def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `hybrid`, `objectives` and random `key`."""
         error_limited = jnp.minimum(INITIAL_STEP_S, self.h * self.steps) + 0.0 * self.h
-        horizon = Horizon(error_limited, self.closest, jnp.asarray(False), jnp.asarray(True), -1, ())
+        horizon = Horizon(error_limited, self.closest, jnp.asarray(False), jnp.asarray(True), no_surface(), ())
         foresee = partial(self.switches.forecast, horizon)
         carry = start_carry(self, hybrid, objectives, key, foresee)
         point, zero, no = carry.point, carry.k, carry.unrestricted

@@ -25,7 +25,7 @@ from diffabs.engine.step.event_location import RunStatus
 from diffabs.engine.step.modes import SlidingSurface, SurfaceCrossing
 from diffabs.engine.step.outlook import look_ahead
 from diffabs.engine.step.runge_kutta import RK4
-from diffabs.engine.step.slides import along_of, begin_slide, ended_slide
+from diffabs.engine.step.slides import along_of, begin_slide, ended_slide, no_surface
 from diffabs.engine.step.switching import FREE_MODES, KEPT_MODES, UNSWITCHED, Checks, ModeGuard, Strain, Unswitched
 from diffabs.engine.step.system import UNCONSTRAINED, Evaluation, Objectives, ObservedSystem
 
@@ -111,7 +111,7 @@ class FixedStepping:
     def start(self, hybrid: HybridSystem, objectives: Objectives, key: Key) -> Carry:
         """Return the carry of a run at t = 0, from `hybrid`, `objectives` and random `key`."""
         method = self._for_values(hybrid)
-        foresee = partial(method._look_ahead, jnp.asarray(True), -1, ())
+        foresee = partial(method._look_ahead, jnp.asarray(True), no_surface(), ())
         carry = start_carry(method, hybrid, objectives, key, foresee)
         return cast_floats(carry._replace(control=FixedStepControl(carry.k, carry.k)), self.h.dtype)
 
@@ -243,7 +243,9 @@ class FixedStepping:
         """Return the numbers at the end of an attempt that must be finite."""
         return end.state.flow()
 
-    def _look_ahead(self, fresh: Bool, ended: Int, along: tuple[SlidingSurface, ...], dynamics: Evaluation) -> PyTree:
+    def _look_ahead(
+        self, fresh: Bool, ended: SlidingSurface, along: tuple[SlidingSurface, ...], dynamics: Evaluation
+    ) -> PyTree:
         return look_ahead(fresh, ended, along, dynamics) if self.has_margin_rates else ()
 
 

@@ -16,7 +16,7 @@ from diffabs.core.types import Array, Bool, PyTree, Scalar
 from diffabs.engine.hybrid import HybridState
 from diffabs.engine.step.advance import Carry
 from diffabs.engine.step.event_location import RunStatus
-from diffabs.engine.step.modes import SlidingSurface, mode_in_step, stack_flat
+from diffabs.engine.step.modes import SlidingSurface, mode_in_step, pick_number, read_bits, stack_flat
 from diffabs.engine.step.slides import along_of
 from diffabs.engine.step.system import Evaluation, ObservedSystem
 
@@ -85,20 +85,22 @@ def find_turns(starts: Outlook, ends: Outlook, length: Scalar, landing: Array) -
     return jax.lax.cond(any_lane(jnp.any(near)), find, lambda: Turns(jnp.zeros_like(length), jnp.asarray(False)))
 
 
-def look_ahead(fresh: Bool, ended: PyTree, along: tuple[SlidingSurface, ...], dynamics: Evaluation) -> Outlook:
+def look_ahead(fresh: Bool, ended: SlidingSurface, along: tuple[SlidingSurface, ...], dynamics: Evaluation) -> Outlook:
     """Return the margins at an instant; it is `fresh` if its numbers have just chosen the mode of the next step.
 
-    `ended` is the number of the comparison whose slide ends here, or -1. The run slides `along` surfaces.
+    `ended` is the surface along which a slide ends here. The run slides `along` surfaces.
     """
     margins, rates, numbers = _list_margins(dynamics, 0)
-    # A run leaves its surface with the rate 0, whose sign is that of a rounding error.
-    rest = (
-        fresh & (numbers == ended) & (jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(dynamics.margins)))
-    )
-    margins, rates = (jnp.where(rest, 0.0, x) for x in (margins, rates))
+    surfaces = jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(dynamics.margins))
+    if ended.answers:
+        # A run leaves its surface with the rate 0, whose sign is that of a rounding error. Another comparison may have
+        # the same surface, as both of `jnp.sign` do.
+        rounding = jnp.abs(pick_number(numbers, ended.number, jnp.where(surfaces, margins, 0.0)))
+        same = (numbers == ended.number) | (read_bits(ended.answers, numbers) & (jnp.abs(margins) <= rounding))
+        rest = fresh & ended.exists & surfaces & same
+        margins, rates = (jnp.where(rest, 0.0, x) for x in (margins, rates))
     # The margin of a newly chosen answer may have any sign. It is turned so that it is positive within the mode. That
     # of a slide is negative where its share has jumped beyond 0 or 1, because another answer has changed.
-    surfaces = jnp.arange(numbers.size) < numbers.size - len(jax.tree.leaves(dynamics.margins))
     for surface in along:
         surfaces &= numbers != surface.number
     turned = fresh & surfaces & ((margins < 0) | ((margins == 0) & (rates < 0)))

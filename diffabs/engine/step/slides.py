@@ -218,9 +218,16 @@ def decided_answers(carry: Any, words: int) -> ModeBits:
     return single_bit(carry.search.number, words)
 
 
-def ended_slide(carry: Any) -> Int:
-    """Return the number of the comparison whose slide the last landing has ended; -1 for none."""
-    return carry.slides.followed.ended if along_of(carry) else jnp.asarray(-1)
+def no_surface() -> SlidingSurface:
+    """Return what stands for a surface in a run that follows none."""
+    return SlidingSurface(jnp.asarray(-1), ())
+
+
+def ended_slide(carry: Any) -> SlidingSurface:
+    """Return the surface along which the last landing has ended a slide; without answers if the run follows none."""
+    if not along_of(carry):
+        return no_surface()
+    return SlidingSurface(carry.slides.followed.ended, carry.slides.followed.decided)
 
 
 def is_return(carry: Any, number: Int) -> Bool:

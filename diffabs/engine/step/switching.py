@@ -73,7 +73,7 @@ class Horizon(NamedTuple):
         shortest: Length of a step within which nothing is located [s].
         unrestricted: True if the next step has no mode.
         fresh: True if the numbers there have just chosen the mode of the next step.
-        ended: Number of the comparison whose slide ends there, or -1.
+        ended: Surface along which a slide ends there.
         along: Surfaces along which the next step slides.
     """
 
@@ -81,7 +81,7 @@ class Horizon(NamedTuple):
     shortest: Scalar
     unrestricted: Bool
     fresh: Bool
-    ended: PyTree
+    ended: SlidingSurface
     along: tuple[SlidingSurface, ...]
 
 
