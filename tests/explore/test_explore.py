@@ -683,7 +683,21 @@ def test_a_transient_ends_when_the_signal_has_settled():
     assert curves.transient_end(never) == 10.0
     still = found._replace(panels=(Panel("1", (Curve("slip", lines[1].values), lines[1])),))
     assert curves.transient_end(still) == 10.0
-    assert charts.change_time_axis(1.23456789) == {"dataZoom": [{"startValue": 0, "endValue": 1.2346}]}
+    assert charts.change_time_axis(1.23456789) == {"dataZoom": [{"startValue": 0, "endValue": 1.234568}]}
+
+
+@killed_by("output.explore.curves", 'name if name in channels else ""', '""')
+@pytest.mark.slow
+def test_each_channel_has_panels_of_its_own():
+    chosen = load("quadruple-tank")
+    found = curves.run_curves(chosen)
+    aims, control = ["target", "setpoint"], ["command"]
+    lines = [["level 1", *aims], ["level 2", *aims], ["level 3", "level 4"], ["pump 1", *control], ["pump 2", *control]]
+    assert [[line.name for line in panel.lines] for panel in found.panels] == lines
+    assert [float(panel.lines[1].values[0]) for panel in found.panels[:2]] == [0.134, 0.127]
+    assert 20.0 < curves.transient_end(found) < 100.0
+    axes = charts.run_chart(found)["yAxis"]
+    assert [axis["name"] for axis in axes[2:4]] == ["level 3, level 4 [m]", "pump 1 [V]"]
 
 
 @killed_by("output.explore.charts", "poles[np.isfinite(poles)]", "poles")
@@ -704,7 +718,7 @@ def test_charts_are_plain_json_whatever_a_run_was():
     change = charts.change_curves(found)
     source = change["dataset"][0]["source"]
     assert source["0.0"] == [0.1, None, None]
-    assert source["0.1"] == [0.0, 1e-30, 123460.0]
+    assert source["0.1"] == [0.0, 1e-30, 123456.8]
     assert change["yAxis"] == [{}, {"min": 0, "max": 15.0, "interval": 5.0}]  # the command is beyond what can be given
     bands = tuple(np.array([[0.0], [1.0], [2.0], [4.0], [8.0]]) for _ in range(2))
     steps = charts.change_fan(Fan(np.array([0.0]), bands, 200, 0, 0, ""))["dataset"][0]["source"]

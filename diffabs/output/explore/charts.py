@@ -13,7 +13,7 @@ from diffabs.output.explore.stability import Stability
 
 BLUE, RED, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#767676", "#1F2933"
 CURVE_COLOURS = (BLUE, RED, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
-CHART_DIGITS = 5  # significant digits of the numbers that go to the browser
+CHART_DIGITS = 7  # significant digits of the numbers that go to the browser; a signal may move little, far from 0
 QUANTITIES = {"rad": "angle", "rad/s": "rate", "km/h": "speed", "N m": "torque", "V": "voltage"}
 # Signals that the loop should follow, with their dashes.
 AIMS = {"target": "dashed", "setpoint": "dotted", "command": "dashed"}
@@ -194,6 +194,7 @@ def _y(panel: Panel, i: int) -> JsonObject:
     return {
         "type": "value",
         "gridIndex": i,
+        "scale": True,  # a level may move little, and far from 0
         "name": axis_label(panel),
         "nameLocation": "middle",
         "nameGap": 48,
@@ -208,8 +209,8 @@ def _y(panel: Panel, i: int) -> JsonObject:
 def axis_label(panel: Panel) -> str:
     """Return the label of a panel's vertical axis: quantity and unit."""
     signals = [line.name for line in panel.lines if line.name not in AIMS]
-    words = signals[0] if len(signals) == 1 and signals[0] != "control" else QUANTITIES.get(panel.unit, signals[0])
-    return f"{words} [{panel.unit}]"
+    words = signals[0] if len(signals) == 1 and signals[0] != "control" else QUANTITIES.get(panel.unit, "")
+    return f"{words or ', '.join(signals[:2])} [{panel.unit}]"
 
 
 def _series(panel: Panel, i: int) -> list[JsonObject]:

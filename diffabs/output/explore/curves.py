@@ -6,9 +6,9 @@ import math
 import jax
 import numpy as np
 
-from diffabs.core.channels import has_channels
+from diffabs.core.channels import select_channel
 from diffabs.core.pytree import get, parameters
-from diffabs.core.types import Part, PyTree
+from diffabs.core.types import Part, Scalar
 from diffabs.core.units import control_units
 from diffabs.engine.solvers import Adaptive, FixedStep, Solver
 from diffabs.linear.robustness import low_discrepancy_points
@@ -34,6 +34,7 @@ MEMBERS = 200  # number of runs of a fan
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 SETTLED_SHARE = 0.05  # settled: the distance from the target stays below this share of its largest value
 TRANSIENT_MULTIPLE = 1.5  # length of a fitted time axis in transients
+AIMS = ("target", "setpoint")
 MIN_TRANSIENT_SHARE = 0.1  # a fan is drawn while this share of its runs goes on
 
 
@@ -160,35 +161,31 @@ def _quantiles(values: np.ndarray) -> np.ndarray:
 def _layout(run: Run, plant: Part) -> list[Panel]:
     """Return the panels of one run or a batch, in full length.
 
-    They are the first signals with target and setpoint, the signals of the next unit, and each control with its
-    command.
+    They are each group of signals with target and setpoint, the first group without, and each control with its command.
+    Signals of one unit are a group; in a loop with several targets each of theirs is a group of its own.
     """
     assert run.trajectory is not None
     sample = run.trajectory.sample
-    groups: dict[str, list[Curve]] = {}
+    channels = getattr(sample.target, "_fields", ())
+    groups: dict[tuple[str, str], list[str]] = {}
     for name, unit in type(sample.output).units.items():
-        words = name.replace("_", " ")
-        groups.setdefault(unit, []).append(Curve(words, np.asarray(getattr(sample.output, name), float)))
-    units = list(groups)
-    aims = [curve for name in ("target", "setpoint") for curve in _channel_curves(name, getattr(sample, name))]
-    shown = [Panel(units[0], (*groups[units[0]], *aims))]
-    shown += [Panel(unit, tuple(groups[unit])) for unit in units[1:2]]
+        groups.setdefault((unit, name if name in channels else ""), []).append(name)
+    aimed, others = [], []
+    for (unit, _), names in groups.items():
+        followed = [name for name in channels or sample.output._fields[:1] if name in names]
+        lines = [_curve(name, getattr(sample.output, name)) for name in names]
+        lines += [_curve(aim, select_channel(getattr(sample, aim), *followed)) for aim in AIMS if followed]
+        (aimed if followed else others).append(Panel(unit, tuple(lines)))
+    shown = [*aimed, *others[:1]]
     shown = [_in_kmh(panel) for panel in shown] if is_vehicle(plant) else shown
-    if not has_channels(sample.control):
-        control = [Curve(name, np.asarray(getattr(sample, name), float)) for name in ("control", "command")]
-        return [*shown, Panel(plant.control_unit, tuple(control))]
-    for channel, unit in control_units(plant).items():
-        signals = {channel: sample.control, f"{channel} command": sample.command}
-        lines = [Curve(words.replace("_", " "), np.asarray(getattr(x, channel), float)) for words, x in signals.items()]
-        shown.append(Panel(unit, tuple(lines)))
+    for name, unit in control_units(plant).items():
+        control, command = (select_channel(signal, name) for signal in (sample.control, sample.command))
+        shown.append(Panel(unit, (_curve(name, control), _curve("command", command))))
     return shown
 
 
-def _channel_curves(name: str, signal: PyTree) -> list[Curve]:
-    """Return the curve of a target, or the curve of each channel."""
-    if not has_channels(signal):
-        return [Curve(name, np.asarray(signal, float))]
-    return [Curve(f"{name} {key.replace('_', ' ')}", np.asarray(x, float)) for key, x in signal._asdict().items()]
+def _curve(name: str, values: Scalar) -> Curve:
+    return Curve(name.replace("_", " "), np.asarray(values, float))
 
 
 def _in_kmh(panel: Panel) -> Panel:
