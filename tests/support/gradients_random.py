@@ -125,7 +125,7 @@ class Program:
         lanes = _compared(lanes)
         sides = lanes[1:].reshape(len(widths), 2, len(x), len(self.objectives)).swapaxes(2, 3)
         names = [path + "".join(f"[{i}]" for i in place) for path, all in self.places.items() for place in all]
-        ended = not late[0] or self.structure.objectives is random_loops.BALANCE
+        ended = not late[0] or self.structure.objectives is not random_loops.BRAKING
         plain, none = _compared(self.plain(loop, measures, x)[0]), np.zeros((len(lanes[0]), len(x)))
         found = Found(self.name, number, self.objectives, names, lanes[0], none, sides, bool(ended), plain, plain)
         if not slopes:

@@ -6,15 +6,17 @@ derivative is documented to say nothing of their jumps: quantisation, a sharp ed
 whose braking is the delay of one sample."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
+import linear_plant
 import numpy as np
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.pytree import parameters, replace
-from diffabs.parts.stops import Fallen, SpeedReached, Standstill
+from diffabs.parts.stops import Fallen, NoStop, SpeedReached, Standstill
 from diffabs.scenario.defaults import braking
 
 BRAKING = {
@@ -30,6 +32,21 @@ BALANCE = {
     "balance_cost": objectives.BalanceCost(r=1e-4),
     "soft_loss": objectives.SoftLoss(),
 }
+
+
+PAIRS = {"left": "a", "right": "b", "middle": "c"}  # output that each control controls
+
+
+def in_channels(count: int) -> dict[str, Any]:
+    """Return objectives of a loop with this number of channels."""
+    pairs = tuple(PAIRS.items())[:count]
+    return {
+        "iae": objectives.OverChannels(channels=pairs, weights=(1.0, 2.0, 0.5)[:count]),
+        "itae": objectives.InChannel(objective=objectives.ITAE(), output="b"),
+        "effort": objectives.InChannel(objective=objectives.Effort(), control="left"),
+        "variation": objectives.InChannel(objective=objectives.Variation(), control="right"),
+        "overshoot": objectives.InChannel(objective=objectives.Overshoot(), output="a", control="left"),
+    }
 
 
 class Draw:
@@ -516,6 +533,176 @@ def _leaning(r: Draw, size: float) -> plants.BalanceStart:
     return plants.BalanceStart(**angles, **{f"{name}_rate": r.near(0.3 * size) for name in angles})
 
 
+def channels(r: Draw, count: int, **fields: Any) -> d.Loop:
+    """Return a loop of two or three channels on a linear plant with one hidden state."""
+    outputs = list(PAIRS.values())[:count]
+    targets = {name: references.Setpoint(value=r.within(0.3, 0.8)) for name in outputs}
+    targets["b"] = linear_plant.Filtered(value=r.within(0.3, 0.8), time_constant=r.near(0.1))
+    parts = {
+        "plant": linear_plant.draw_plant(r.rng, count),
+        "initial": linear_plant.Start(x=r.rng.uniform(-0.2, 0.2, count + 1)),
+        "reference": references.PerTarget(reference=targets),
+        "feedforward": controllers.HoldingInput(),
+        "stop": NoStop(),
+    }
+    return d.Loop(**parts | fields)
+
+
+def channel_pid(r: Draw, antiwindup: Any = None, derivative: bool = False, integral: bool = True) -> controllers.PID:
+    """Return a PID of one channel that meets its limits."""
+    return controllers.PID(
+        kp=r.near(5.0),
+        ki=r.near(4.0, 0.5) if integral else 0.0,
+        kd=r.near(0.1) if derivative else 0.0,
+        cutoff=r.near(15.0),
+        low=-r.within(0.3, 1.0),
+        high=r.within(1.2, 2.2),
+        antiwindup=antiwindup or controllers.NoAntiWindup(),
+    )
+
+
+def per_channel(*each: Any) -> controllers.PerChannel:
+    """Return these controllers, one for each channel."""
+    names = list(PAIRS)[: len(each)]
+    return controllers.PerChannel(dict(zip(names, each, strict=True)), {name: PAIRS[name] for name in names})
+
+
+def channel_noise(r: Draw) -> sensors.OutputNoise:
+    """Return noise of one output."""
+    return sensors.OutputNoise(deviation=r.near(0.02), period=0.04)
+
+
+def back_calculation(r: Draw) -> controllers.BackCalculation:
+    return controllers.BackCalculation(tracking_time=r.near(0.3))
+
+
+def two_pids(r: Draw) -> d.Loop:
+    chain = Series(blocks=(actuators.RateLimit(rate=r.near(20.0), time_constant=r.near(0.02)), limits(r)))
+    return channels(
+        r,
+        2,
+        controller=per_channel(channel_pid(r, controllers.Clamping(), True), channel_pid(r, back_calculation(r))),
+        actuator=actuators.PerControl(actuator={"left": actuators.Lag(time_constant=r.near(0.05)), "right": chain}),
+        sensor=sensors.PerOutput(sensor={"a": actuators.Lag(time_constant=r.near(0.03))}),
+    )
+
+
+def limits(r: Draw) -> actuators.Limits:
+    return actuators.Limits(low=-r.within(0.2, 0.5), high=r.within(0.9, 1.4))
+
+
+def two_computers(r: Draw) -> d.Loop:
+    fast = controllers.Sampled(
+        controller=channel_pid(r, controllers.Clamping()), period=0.04, delay=r.within(5e-3, 0.03)
+    )
+    slow = controllers.Sampled(controller=channel_pid(r, None, True), period=0.05, delay=0.0)
+    return channels(
+        r,
+        2,
+        controller=per_channel(fast, slow),
+        actuator=actuators.PerControl(actuator={"left": limits(r), "right": actuators.Lag(time_constant=r.near(0.05))}),
+        sensor=sensors.PerOutput(sensor={"b": channel_noise(r)}),
+    )
+
+
+def two_delays(r: Draw) -> d.Loop:
+    delay = actuators.Delay(time=r.near(0.0313), capacity=64)
+    return channels(
+        r,
+        2,
+        controller=controllers.SelectLow(
+            controller=per_channel(channel_pid(r), channel_pid(r, back_calculation(r))), groups=(("left", "right"),)
+        ),
+        actuator=actuators.PerControl(
+            actuator={"left": Series(blocks=(delay, actuators.Lag(time_constant=r.near(0.03)))), "right": limits(r)}
+        ),
+    )
+
+
+def matrix_fields(r: Draw, count: int, states: int) -> dict[str, Any]:
+    """Return gain, anti-windup and limits of a full gain."""
+    integral = -np.diag([r.near(3.0) for _ in range(count)]) + r.rng.uniform(-0.4, 0.4, (count, count))
+    proportional = -3.0 * np.eye(count, states) + r.rng.uniform(-0.5, 0.5, (count, states))
+    return {
+        "gain": np.hstack([integral, proportional]),
+        "windup": np.linalg.inv(integral) / r.near(0.3),
+        "low": -np.array([r.within(0.3, 1.0) for _ in range(count)]),
+        "high": np.array([r.within(0.8, 1.6) for _ in range(count)]),
+        "outputs_at_rest": r.rng.uniform(0.0, 0.2, count),
+    }
+
+
+def full_gain(r: Draw, count: int) -> d.Loop:
+    outputs = tuple(PAIRS.values())[:count]
+    return channels(
+        r,
+        count,
+        controller=controllers.MatrixFeedback(**matrix_fields(r, count, count), states=outputs),
+        actuator=actuators.PerControl(
+            actuator={"left": actuators.AsymmetricLag(rise=r.near(0.06), fall=r.near(0.03)), "right": limits(r)}
+        ),
+        sensor=sensors.PerOutput(sensor={"a": channel_noise(r)}),
+    )
+
+
+def observed_channels(r: Draw, count: int) -> d.Loop:
+    model = linear_plant.draw_plant(r.rng, count)
+    return channels(
+        r,
+        count,
+        controller=controllers.ObservedFeedback(
+            **matrix_fields(r, count, count + 1),
+            state_matrix=model.A,
+            input_matrix=model.B,
+            output_matrix=np.eye(count, count + 1),
+            observer_gain=4.0 * np.eye(count + 1, count) + r.rng.uniform(-0.5, 0.5, (count + 1, count)),
+            outputs=tuple(PAIRS.values())[:count],
+        ),
+        sensor=sensors.PerOutput(sensor={"b": channel_noise(r)}),
+    )
+
+
+def three_computers(r: Draw) -> d.Loop:
+    each = per_channel(
+        channel_pid(r, controllers.Clamping()), channel_pid(r, None, True), channel_pid(r, None, False, False)
+    )
+    return channels(
+        r,
+        3,
+        controller=controllers.Sampled(controller=each, period=0.04, delay=r.within(5e-3, 0.03)),
+        actuator=actuators.PerControl(
+            actuator={
+                "left": actuators.DeadTime(rise=r.near(0.03), fall=r.near(0.02)),
+                "middle": actuators.Lag(time_constant=r.near(0.04)),
+                "right": limits(r),
+            }
+        ),
+        sensor=sensors.PerOutput(sensor={"c": channel_noise(r)}),
+    )
+
+
+def three_logic(r: Draw) -> d.Loop:
+    first = per_channel(channel_pid(r), channel_pid(r, None, True), channel_pid(r, controllers.Clamping()))
+    second = controllers.PerChannel(channel_pid(r, None, False, False), PAIRS)
+    least = linear_plant.LeastOf(first=first, second=second)
+    return channels(
+        r,
+        3,
+        controller=linear_plant.Difference(controller=least, limit=r.within(0.1, 0.3)),
+        actuator=actuators.PerControl(actuator={"left": actuators.Lag(time_constant=r.near(0.04)), "right": limits(r)}),
+    )
+
+
+CHANNELS = {
+    "two channels, PIDs": (two_pids, 2),
+    "two channels, computers, noise": (two_computers, 2),
+    "two channels, delay, select low": (two_delays, 2),
+    "two channels, full gain": (partial(full_gain, count=2), 2),
+    "two channels, observer": (partial(observed_channels, count=2), 2),
+    "three channels, full gain": (partial(full_gain, count=3), 3),
+    "three channels, computer, noise": (three_computers, 3),
+    "three channels, logic": (three_logic, 3),
+}
 STRUCTURES = {
     "latch": Structure(latch),
     "latch, spline, lag": Structure(latch_spline),
@@ -548,6 +735,7 @@ STRUCTURES = {
     "arm": Structure(arm, 5e-4, 0.5, BALANCE),
     "arm, observed": Structure(observed, 1e-3, 0.4, BALANCE),
     "fall": Structure(fall, 1e-3, 3.0, BALANCE),
+    **{name: Structure(make, 2.5e-3, 2.0, in_channels(count)) for name, (make, count) in CHANNELS.items()},
 }
 
 
