@@ -67,7 +67,7 @@ def identify(
             setup = console.load_scenario(scenario, changes)
             units = setup.loop.plant.shows.units
             file_form = identify_options.read_renames(rename or ()), read_separator(separator, "--separator")
-            readings = identify_options.read_columns(data, column, units, *file_form)
+            readings = identify_options.read_columns(data, column, setup.loop.plant, *file_form)
             noise = identify_options.read_noise(sigma or (), readings, units)
             ranges = identify_options.read_ranges(free, setup)
             fit, noise, interrupted = _fit_with_progress(setup, readings, ranges, noise)

@@ -5,10 +5,11 @@ from collections.abc import Mapping, Sequence
 
 from diffabs.cli import console
 from diffabs.cli.options import read_assignments
+from diffabs.core.protocols import Plant
 from diffabs.core.pytree import ParameterSpec
 from diffabs.host.values import ScenarioError, format_given, read_number_in_range, unknown_name_error
 from diffabs.scenario import section_tune, toml
-from diffabs.scenario.measurements import Readings, read_measurements
+from diffabs.scenario.measurements import Readings, loop_columns, read_measurements
 from diffabs.scenario.parameter_paths import flatten_table
 from diffabs.scenario.scenario import Scenario
 
@@ -35,13 +36,13 @@ def read_renames(options: Sequence[str]) -> dict[str, str]:
 def read_columns(
     data: pathlib.Path,
     names: Sequence[str] | None,
-    units: Mapping[str, str],
+    plant: Plant,
     renamed: Mapping[str, str] | None = None,
     separator: str | None = None,
 ) -> Readings:
     """Return the columns of a file that are compared. Who names some columns may have others in the file."""
-    strict = not (names or renamed)
-    readings = read_measurements(data, units, renamed=renamed, separator=separator, strict=strict)
+    form = {"renamed": renamed, "separator": separator, "strict": not (names or renamed)}
+    readings = read_measurements(data, plant.shows.units, ignored=loop_columns(plant), **form)
     if readings.unread:
         console.say(f"note: not compared: {', '.join(readings.unread)}")
     if readings.infinite and not names:

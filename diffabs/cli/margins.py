@@ -62,9 +62,8 @@ def margins(
                 console.fail(f"{setup.name}: {error}", console.FAILED)
             result = {"scenario": setup.name, **margin_results.record(), "versions": provenance.versions(), "files": {}}
             result = documents.stamp("margins", result)
-            view = show_margins.show_margins
-            if isinstance(margin_results, ScenarioChannelMargins):
-                view = show_margins.show_channel_margins
+            has_channels = isinstance(margin_results, ScenarioChannelMargins)
+            view = show_margins.show_channel_margins if has_channels else show_margins.show_margins
             show_result = partial(show.show_result, as_json, view, result, setup, margin_results)
             if picture and isinstance(margin_results, ScenarioMargins):
                 with console.show_before_errors(show_result):
@@ -102,13 +101,10 @@ def _draw(scenario: Scenario, margins: ScenarioMargins, picture: pathlib.Path) -
 
 def _judge(scenario: Scenario, margins: ScenarioMargins | ScenarioChannelMargins) -> None:
     """Raise typer.Exit for a loop that is unstable, here or within the ranges."""
-    if isinstance(margins, ScenarioChannelMargins):
-        if not margins.margins.stable:
-            console.conclude(f"{scenario.name}: the closed loop is not stable: no margins")
-        return
-    if not margins.nominal.margins.stable:
+    nominal = margins if isinstance(margins, ScenarioChannelMargins) else margins.nominal
+    if not nominal.margins.stable:
         console.conclude(f"{scenario.name}: the closed loop is not stable: no margins")
-    if unstable := margins.band.unstable:
+    if isinstance(margins, ScenarioMargins) and (unstable := margins.band.unstable):
         first = show_margins.format_place(unstable[0].values, scenario)
         count = f"{len(unstable)} of {len(margins.band.systems)} systems"
         console.conclude(f"{scenario.name}: not stable in {count} of the ranges, as at {first}")

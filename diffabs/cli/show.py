@@ -73,6 +73,9 @@ def show_family(name: str, members: JsonObject) -> None:
         table = Table("type", "field", "default", "unit", "range", "meaning")
         for member, about in members.items():
             member = f"{member} [{about['unit']}]" if about.get("unit") else member
+            for role, channels in about.get("channels", {}).items():
+                table.add_row(member, role, ", ".join(channels), ", ".join(channels.values()), "", "")
+                member = ""
             fields = about["parameters"] or {"": {"default": "", "unit": "", "range": "", "meaning": ""}}
             for field, row in fields.items():
                 range_ = row["range"].removesuffix(row["unit"])

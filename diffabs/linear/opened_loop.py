@@ -26,7 +26,7 @@ from diffabs.core.blocks import Direct, Series, offers
 from diffabs.core.channels import control_names, has_channels, outputs_like
 from diffabs.core.jax_flags import default_flags
 from diffabs.core.protocols import Clock, Memory, Tracking
-from diffabs.core.pytree import canonical_dtypes
+from diffabs.core.pytree import canonical_dtypes, parts
 from diffabs.core.tracing import depends_on_signal
 from diffabs.core.types import Array, Bool, Part, PyTree, Scalar
 from diffabs.core.validity import check_part
@@ -166,7 +166,14 @@ def _split_off_delays(loop: Loop) -> tuple[Loop, float]:
     blocks = loop.actuator.blocks if isinstance(loop.actuator, Series) else (loop.actuator,)
     delay = float(sum(block.time for block in blocks if isinstance(block, Delay)))
     undelayed = tuple(block for block in blocks if not isinstance(block, Delay))
+    if any(map(_has_delay, undelayed)):
+        name = type(loop.actuator).__name__
+        raise ValueError(f"actuator {name} delays some controls: a linear loop has one delay, a Delay of all controls")
     return dataclasses.replace(loop, actuator=Series(blocks=undelayed) if undelayed else Direct()), delay  # pyright: ignore
+
+
+def _has_delay(block: Part) -> bool:
+    return isinstance(block, Delay) or any(map(_has_delay, parts(block)))
 
 
 def _check_continuous(loop: Loop) -> None:

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs.core.channels import control_names
+from diffabs.core.protocols import Plant
 from diffabs.core.types import JsonObject
 from diffabs.host import files, separated
 from diffabs.host.values import ScenarioError, format_given, unknown_name_error
@@ -21,8 +23,6 @@ TIME_COLUMN = "t [s]"
 TIME_NAMES = ("t", "time", "time [s]")  # of the column, beside TIME_COLUMN, in small or capital letters
 RENAME_HINT = '--rename "COLUMN=NAME" gives a column the name of a signal, or t'
 MAX_LISTED = 20  # columns of the file that a message lists
-# Beginnings of the columns of a simulation without a measurement: of the signal, or of a channel of it.
-IGNORED = tuple(f"{name}{end}" for name in LOOP_SIGNALS for end in (" [", "_"))
 
 
 class Readings(NamedTuple):
@@ -54,6 +54,13 @@ class Readings(NamedTuple):
         return {"samples": len(self.t), "columns": list(self.columns), "until": float(self.t[-1])}
 
 
+def loop_columns(plant: Plant) -> tuple[str, ...]:
+    """Return the names of a simulation's columns that are no measurement: target, or target_level_1, and so on."""
+    aims, controls = getattr(plant.shows, "tracked", ()), control_names(plant)
+    channels = {name: aims if name in ("target", "setpoint") else controls for name in LOOP_SIGNALS}
+    return tuple(full for name in LOOP_SIGNALS for full in [f"{name}_{key}" for key in channels[name]] or [name])
+
+
 def read_separator(text: str | None, where: str) -> str | None:
     """Return the character between cells that a text names, None to guess it. Raises ScenarioError."""
     if text is None:
@@ -71,17 +78,18 @@ def read_measurements(
     renamed: Mapping[str, str] | None = None,
     separator: str | None = None,
     strict: bool = True,
+    ignored: Sequence[str] = LOOP_SIGNALS,
 ) -> Readings:
     """Return the readings in a file.
 
     Args:
-        path: File of UTF-8 text, at most `MAX_MEASUREMENT_BYTES` long, with the column `t [s]`. Columns of the
-            loop's other signals (`LOOP_SIGNALS`) are ignored. A column that is infinite in every row, such as a limit
-            that the simulation lacks, is ignored if another column is left.
+        path: File of UTF-8 text, at most `MAX_MEASUREMENT_BYTES` long, with the column `t [s]`. A column that is
+            infinite in every row, such as a limit that the simulation lacks, is ignored if another column is left.
         units: Units of the plant's signals by name: a column's header is `name [unit]`.
         renamed: Signal, or `t`, by the name of its column in the file. Its values have the signal's unit.
         separator: Character between the cells; None guesses comma, semicolon or tab.
         strict: Whether to refuse a column with an unknown name; otherwise it is left out.
+        ignored: Names of the loop's other signals (`loop_columns`), whose columns are left out.
 
     Raises:
         ScenarioError: The file cannot be read, a column is unknown, or there is no signal or no row. Also raised for a
@@ -105,7 +113,7 @@ def read_measurements(
         raise ScenarioError(f"--data {path}: {error}{hint}") from None
     titles = [cell.strip() for cell in rows[0]] if rows else []
     header = _translate(titles, path, units, renamed or {})
-    names, unread = _names(header, titles, path, units, strict)
+    names, unread = _names(header, titles, path, units, strict, ignored)
     used = [header.index(TIME_COLUMN), *names]
     comma = _has_decimal_commas(rows, used, separator, path)
     numbers = np.array([_numbers(row, i, titles, used, comma, path) for i, row in enumerate(rows[1:], 2) if row], float)
@@ -151,7 +159,12 @@ def _translate(
 
 
 def _names(
-    header: Sequence[str], titles: Sequence[str], path: pathlib.Path, units: Mapping[str, str], strict: bool
+    header: Sequence[str],
+    titles: Sequence[str],
+    path: pathlib.Path,
+    units: Mapping[str, str],
+    strict: bool,
+    ignored: Sequence[str],
 ) -> tuple[dict[int, str], tuple[str, ...]]:
     """Return the names of the compared columns by column number, and the names of unknown columns."""
     headers = {f"{name} [{unit}]": name for name, unit in units.items()}
@@ -166,7 +179,8 @@ def _names(
         is_known = name == TIME_COLUMN or name in headers
         if is_known and header.count(name) > 1:
             raise ScenarioError(f"--data {path}: column {format_given(name)} occurs twice")
-        if is_known or not name or name.startswith(IGNORED):  # without a name: a separator at the end of the lines
+        others = tuple(f"{signal} [" for signal in ignored)
+        if is_known or not name or name.startswith(others):  # without a name: a separator at the end of the lines
             continue
         if strict:
             message = f"--data {path}: column {format_given(name)} is unknown"

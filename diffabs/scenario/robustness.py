@@ -6,6 +6,7 @@ from typing import NamedTuple
 from diffabs.core.channels import control_names, need_single_control
 from diffabs.core.pytree import replace
 from diffabs.core.types import JsonObject
+from diffabs.host.values import ScenarioError
 from diffabs.linear.multivariable_margins import MULTIVARIABLE_UNITS, MultivariableMargins, multivariable_margins
 from diffabs.linear.opened_loop import OpenLoop, open_loop
 from diffabs.linear.robustness import Band, System, band
@@ -83,11 +84,15 @@ def examine_margins(
         samples: Number of systems inside the ranges, added to the corners.
 
     Raises:
+        ScenarioError: A loop with several controls has a `target`, which is one of several.
         ValueError: The loop has no linear model at a point, or several controls and [design.over].
     """
     values = dict(values or {})
     loop = replace(scenario.loop, values)
     if control_names(loop.plant):
+        if target is not None:
+            names = ", ".join(getattr(scenario.loop.plant.shows, "tracked", ()))
+            raise ScenarioError(f"--at target = {target:g}: there are several targets, {names}; set their references")
         if scenario.design.over:
             need_single_control(loop.plant, "margins over [design.over]")
         opened = open_loop(loop, target)

@@ -88,6 +88,10 @@ REFUSED = {
         ["simulate", "quadruple-tank", "--set", "controller.pump_1.cutoff=-3"],
         "controller.pump_1.cutoff = -3 is outside (0, inf) rad/s",
     ),
+    "one of several targets": (
+        ["margins", "quadruple-tank", "--at", "target=0.13"],
+        "--at target = 0.13: there are several targets, level_1, level_2; set their references",
+    ),
     "a proof": (["certify", "quadruple-tank"], "needs a loop with one control; plant QuadrupleTank has pump_1, pump_2"),
 }
 

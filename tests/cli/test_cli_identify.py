@@ -2,6 +2,7 @@
 
 import json
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -325,11 +326,12 @@ def test_a_limit_that_a_simulation_lacks_is_not_measured(csv):
 @killed_by("cli.identify_options", "if readings.infinite and not names:", "if False:")
 def test_a_column_that_is_left_out_is_named(csv, capsys):
     path, units = csv("t [s],psi [rad],current_max [A]", "0,0.1,inf", "0.1,0.2,inf"), {"psi": "rad", "current_max": "A"}
-    found = identify_options.read_columns(path, None, units)
+    plant = types.SimpleNamespace(shows=types.SimpleNamespace(units=units))
+    found = identify_options.read_columns(path, None, plant)
     assert list(found.columns) == ["psi"]
     line = "note: current_max is infinite in every row of the data, and is not compared\n"
     assert capsys.readouterr().err == line
-    identify_options.read_columns(path, ["psi"], units)
+    identify_options.read_columns(path, ["psi"], plant)
     assert capsys.readouterr().err == ""
     with pytest.raises(ScenarioError, match="--column current_max is infinite in every row of the data"):
-        identify_options.read_columns(path, ["current_max"], units)
+        identify_options.read_columns(path, ["current_max"], plant)

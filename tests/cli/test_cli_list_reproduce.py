@@ -4,6 +4,7 @@ import importlib
 import json
 import os
 import pathlib
+import re
 import sys
 import types
 
@@ -52,6 +53,14 @@ def test_list_table_shows_units_and_ranges():
     assert "[0, 1]" in text
     assert "snow" not in text
     assert "[dry-asphalt, snow]" in run("list", "roads").stdout
+
+
+def test_list_shows_the_channels_of_a_plant():
+    plants = json.loads(run("list", "plants", "--json").stdout)["plants"]
+    channels = {"controls": {"pump_1": "V", "pump_2": "V"}, "targets": {"level_1": "m", "level_2": "m"}}
+    assert plants["quadruple-tank"]["channels"] == channels
+    assert "channels" not in plants["quarter-car"]
+    assert re.search(r"controls *│ pump_1, pump_2 *│ V, V", run("list", "plants").stdout)
 
 
 def test_list_of_an_unknown_family():

@@ -331,3 +331,12 @@ def test_the_page_runs(capsys):
     assert phase > 1
     assert disk > 1
     assert smallest == pytest.approx(1.0, abs=1e-6)
+
+
+@killed_by("linear.opened_loop", "isinstance(block, Delay) or any", "any")
+@pytest.mark.parametrize("block", [Delay(time=0.5), Series(blocks=(Delay(time=0.5), Lag()))])
+def test_a_delay_of_one_control_is_refused(block):
+    loop = tank(actuator=PerControl(actuator={"pump_1": block}))
+    with pytest.raises(ValueError, match="actuator PerControl delays some controls: a linear loop has one delay"):
+        open_loop(loop)
+    assert open_loop(tank(actuator=Delay(time=0.5))).delay == 0.5

@@ -1,12 +1,15 @@
 """Measured runs in the files of data loggers: separators, decimal commas, other names of columns."""
 
+import re
+
 import pytest
 from commands import assert_one_error_line, run
 from mutants import killed_by
 from small_scenarios import IDENTIFY as SMALL
 
 from diffabs.core.protocols import BrakeOutput
-from diffabs.scenario.measurements import read_measurements
+from diffabs.parts.plants import QuadrupleTank, QuarterCar
+from diffabs.scenario.measurements import loop_columns, read_measurements
 from diffabs.scenario.scenario import ScenarioError
 
 UNITS = BrakeOutput.units
@@ -114,3 +117,20 @@ def test_options_that_fit_no_file(file, csv, options, line):
 def test_readings_have_a_record(csv):
     readings = read_measurements(csv("t [s],slip [1],speed [m/s]\n0,0,13.5\n0.25,0.125,12\n1.5,1e-3,0.5\n"), UNITS)
     assert readings.select(["slip"]).record() == {"samples": 3, "columns": ["slip"], "until": 1.5}
+
+
+@pytest.mark.parametrize(
+    ("plant", "own", "other"),
+    [
+        (QuadrupleTank(), "control_pump_1 [V],target_level_2 [m]", "control_pump_3 [V]"),
+        (QuadrupleTank(), "feedforward_pump_2 [V]", "setpoint [m]"),
+        (QuarterCar(), "control [N m],target [1]", "control_pump_1 [V]"),
+    ],
+)
+def test_only_columns_of_the_plants_own_channels_are_left_out(csv, plant, own, other):
+    output, unit = next(iter(plant.shows.units.items()))
+    ignored, cells = loop_columns(plant), ",".join("1" for _ in own.split(","))
+    text = f"t [s],{output} [{unit}],{own}\n0,0.1,{cells}\n1,0.2,{cells}\n"
+    assert [*read_measurements(csv(text), plant.shows.units, ignored=ignored).columns] == [output]
+    with pytest.raises(ScenarioError, match=re.escape(f'column "{other}" is unknown')):
+        read_measurements(csv(text.replace(own, f"{other},{own}")), plant.shows.units, ignored=ignored)
