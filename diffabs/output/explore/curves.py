@@ -34,7 +34,6 @@ MEMBERS = 200  # number of runs of a fan
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 SETTLED_SHARE = 0.05  # settled: the distance from the target stays below this share of its largest value
 TRANSIENT_MULTIPLE = 1.5  # length of a fitted time axis in transients
-AIMS = ("target", "setpoint")
 MIN_TRANSIENT_SHARE = 0.1  # a fan is drawn while this share of its runs goes on
 
 
@@ -174,7 +173,8 @@ def _layout(run: Run, plant: Part) -> list[Panel]:
     for (unit, _), names in groups.items():
         followed = [name for name in channels or sample.output._fields[:1] if name in names]
         lines = [_curve(name, getattr(sample.output, name)) for name in names]
-        lines += [_curve(aim, select_channel(getattr(sample, aim), *followed)) for aim in AIMS if followed]
+        for name in followed:
+            lines += [_curve(aim, select_channel(getattr(sample, aim), name)) for aim in ("target", "setpoint")]
         (aimed if followed else others).append(Panel(unit, tuple(lines)))
     shown = [*aimed, *others[:1]]
     shown = [_in_kmh(panel) for panel in shown] if is_vehicle(plant) else shown
