@@ -2,7 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 
+from diffabs.core.types import JsonObject
+from diffabs.host.separated import read_decimal
 from diffabs.host.values import ScenarioError, format_given
+from diffabs.scenario.parameter_paths import BoxSide, read_box
+from diffabs.scenario.scenario import Scenario
+
+SECONDS = {"s": 0, "ms": -3, "us": -6}  # powers of ten
 
 
 def read_assignments(texts: Sequence[str], option: str, form: str = "") -> Iterator[tuple[str, str, str]]:
@@ -19,3 +25,26 @@ def read_assignments(texts: Sequence[str], option: str, form: str = "") -> Itera
             raise ScenarioError(f"{option} {name} is given twice")
         names.add(name)
         yield name, value, text
+
+
+def read_sides(options: Sequence[str], scenario: Scenario) -> list[BoxSide]:
+    """Return the range of each parameter of --over."""
+    table: JsonObject = {}
+    for path, ends, text in read_assignments(options, "--over"):
+        low, _, high = ends.partition(":")
+        try:
+            table[path] = [read_decimal(low), read_decimal(high)]
+        except ValueError:
+            raise ScenarioError(f"--over {format_given(text)} is not of the form path=low:high") from None
+    return read_box(table, "--over", scenario.loop)
+
+
+def read_time(text: str, option: str) -> float:
+    """Return the time [s] of a text such as `5 ms`; without a unit it is in seconds."""
+    words = text.split()
+    try:
+        power = SECONDS[words[1]] if len(words) == 2 else 0
+        value = read_decimal(words[0])
+        return float(f"{value!r}e{power}") if len(words) <= 2 and "e" not in repr(value) else value * 10.0**power
+    except (IndexError, KeyError, ValueError):
+        raise ScenarioError(f'{option} {format_given(text)}: a time is needed, as in {option} "5 ms"') from None

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from diffabs.cli import console, show, show_proofs, targets
-from diffabs.cli.options import read_assignments
-from diffabs.core.types import JsonObject
-from diffabs.host.separated import read_decimal
-from diffabs.host.values import ScenarioError, format_given
+from diffabs.cli.options import read_sides
+from diffabs.host.values import ScenarioError
 from diffabs.scenario.model import result_document
-from diffabs.scenario.parameter_paths import BoxSide, read_box
+from diffabs.scenario.parameter_paths import BoxSide
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -59,7 +57,7 @@ def prove(
 
         setup = console.load_scenario(scenario, changes or (), integrated=False)
         console.refuse_several_controls(setup, "prove")
-        sides = _read_sides(over, setup)
+        sides = read_sides(over, setup)
         box = {side.path: side.ends for side in sides}
         if plot:
             _check_drawable(box)
@@ -87,18 +85,6 @@ def prove(
         show_result()
         if proof.verdict != "proved":
             console.conclude(f"{setup.name}: {proof.verdict}: {result['reason']}")
-
-
-def _read_sides(options: Sequence[str], scenario: Scenario) -> list[BoxSide]:
-    """Return the range of each parameter of --over."""
-    table: JsonObject = {}
-    for path, ends, text in read_assignments(options, "--over"):
-        low, _, high = ends.partition(":")
-        try:
-            table[path] = [read_decimal(low), read_decimal(high)]
-        except ValueError:
-            raise ScenarioError(f"--over {format_given(text)} is not of the form path=low:high") from None
-    return read_box(table, "--over", scenario.loop)
 
 
 def _check_drawable(box: Mapping[str, tuple[float, float]]) -> None:

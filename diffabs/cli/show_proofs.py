@@ -28,6 +28,18 @@ def show_box_proof(result: JsonObject, scenario: Scenario) -> None:
     say(f"{result['cells']:,} cells proved, {result['tried']:,} tried, {result['seconds']:.1f} s")
 
 
+def show_frequency_proof(result: JsonObject, scenario: Scenario) -> None:
+    """Show what is proved of each claim, beside the greatest sensitivity that was met."""
+    table = Table("claim", "verdict", "greatest |S| found", "at", "cells", "seconds")
+    for row in result["claims"]:
+        worst = row["worst"] or {}
+        place = ", ".join(f"{name} {worst[name]:.5g}" for name in worst if name not in ("sensitivity", "frequency"))
+        where = f"{worst['frequency']:.5g} rad/s, {place}" if worst else ""
+        size = f"{worst['sensitivity']:.6g}" if worst else ""
+        table.add_row(row["claim"], row["verdict"], size, where, f"{row['cells']:,}", f"{row['seconds']:.1f}")
+    show_titled_table(f"{scenario.title or scenario.name}: for every {describe_box(result['over'], scenario)}", table)
+
+
 def describe_box(box: Mapping[str, Sequence[float]], scenario: Scenario, digits: int = 6) -> str:
     """Return a box in words, in SI units."""
     specs = parameters_of(scenario.loop)

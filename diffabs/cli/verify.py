@@ -20,11 +20,16 @@ def verify_certificate(
         typer.Option(help="Of a file of design or certify: limit of the computing time [s]; then not proved."),
     ] = 6.0,
     share: Annotated[
-        float, typer.Option(help="Of a file of prove: share of its cells to check, drawn at random.")
-    ] = 0.01,
+        float | None,
+        typer.Option(
+            help="Of a file of prove or certify --sensitivity: share of its cells to check, drawn at random.  "
+            "[default: 0.01 of prove, else 1]"
+        ),
+    ] = None,
     as_json: console.Json = False,
 ) -> None:
-    """Prove a saved certificate again: of design and certify in exact fractions, of prove in Arb's balls.
+    """Prove a saved certificate again: of design and certify in exact fractions, of prove and
+    certify --sensitivity in Arb's balls.
 
     The code is independent of the code that made the certificate.
     Exit status: 0 proved, or not refuted where --share leaves cells unchecked; 1 not proved, 2 no certificate."""
@@ -33,7 +38,7 @@ def verify_certificate(
     with console.end_on_errors():
         if not 0 < seconds < math.inf:
             console.fail(f"--seconds = {seconds:g} is outside (0, inf) s")
-        if not 0 < share <= 1:
+        if share is not None and not 0 < share <= 1:
             console.fail(f"--share = {share:g} is outside (0, 1]")
         try:
             verification = console.run_with_lines(

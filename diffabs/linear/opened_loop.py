@@ -130,12 +130,21 @@ def linear_controller(loop: Loop, target: Scalar | None = None) -> Transfer:
     return _open(loop, target, plant=False).controller
 
 
+@default_flags()
+def rest_point(loop: Loop, target: Scalar | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where `open_loop` linearises: states of plant, sensor and actuator, command, and controller's memory."""
+    open_loop(loop, target)  # refuses a loop without a linear model
+    undelayed = split_off_delays(loop)[0]
+    setpoint = _start_output_and_setpoint(undelayed)[1] if target is None else float(target)
+    return jax.device_get(_linearize_halves(undelayed, setpoint).point)
+
+
 def _open(loop: Loop, target: Scalar | None, *, plant: bool) -> OpenLoop:
     """Return the open loop. `plant`: whether the parts around the controller must be smooth, too."""
     check_part(loop)
     if target is not None and not np.isfinite(target):
         raise ValueError(f"target = {float(target):g} is outside (-inf, inf), in the unit of the first signal")
-    rational, delay = _split_off_delays(loop)
+    rational, delay = split_off_delays(loop)
     _check_continuous(rational)
     setpoint = _start_output_and_setpoint(loop)[1]
     if target is not None and has_channels(setpoint):
@@ -151,7 +160,7 @@ def _open(loop: Loop, target: Scalar | None, *, plant: bool) -> OpenLoop:
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     delay += float(sampled.delay) if sampled else 0.0
     controller = Transfer(*linear.controller)._replace(period=float(sampled.period) if sampled else None)
-    model = OpenLoop(Transfer(*linear.plant), controller, delay, control_names(loop.plant))
+    model = OpenLoop(Transfer(*linear.plant), controller, float(delay), control_names(loop.plant))
     if not len(model.transfer().A):
         raise ValueError(
             f"controller {type(loop.controller).__name__}: its command does not follow what is measured at the "
@@ -160,11 +169,11 @@ def _open(loop: Loop, target: Scalar | None, *, plant: bool) -> OpenLoop:
     return model
 
 
-def _split_off_delays(loop: Loop) -> tuple[Loop, float]:
+def split_off_delays(loop: Loop) -> tuple[Loop, Scalar]:
     """Return the loop without its actuator's pure delays, and the sum of these delays [s]."""
     # A pure delay commutes with linear blocks, so its place in the series does not matter.
     blocks = loop.actuator.blocks if isinstance(loop.actuator, Series) else (loop.actuator,)
-    delay = float(sum(block.time for block in blocks if isinstance(block, Delay)))
+    delay = sum(block.time for block in blocks if isinstance(block, Delay))
     undelayed = tuple(block for block in blocks if not isinstance(block, Delay))
     if any(map(_has_delay, undelayed)):
         name = type(loop.actuator).__name__
@@ -207,14 +216,15 @@ class _SurroundingStates(NamedTuple):
 
 
 class _LinearHalves(NamedTuple):
-    """Matrices (A, B, C, D) of both halves, their distance from rest, relative to the state, and whether each half is
-    at a kink.
+    """Matrices (A, B, C, D) of both halves, their distance from rest, relative to the state, whether each half is at a
+    kink, and the point: states around the controller, command, and the controller's memory.
     """
 
     plant: Part
     controller: Part
     residue: Scalar
     kinked: tuple[Bool, Bool]
+    point: tuple[Array, Array, Array]
 
 
 def _start_output_and_setpoint(loop: Loop) -> tuple[PyTree, PyTree]:
@@ -245,7 +255,8 @@ def _linearize_halves(loop: Loop, setpoint: Scalar) -> _LinearHalves:
     bent = is_kinked(lambda z, v: jnp.concatenate([around.moves(z, v)[:n], around.signals(z)]), steps, z, command)
     controller, compute, inside = _linearize_controller(loop, signal, as_signal, command)
     moves = jax.vmap(lambda step: jax.jvp(around.signals, (z,), (step,))[1])(steps)
-    return _LinearHalves(plant, controller, residue, (bent, is_kinked(compute, moves, signal, inside)))
+    bends = (bent, is_kinked(compute, moves, signal, inside))
+    return _LinearHalves(plant, controller, residue, bends, (z, command, inside))
 
 
 class _Surroundings:
@@ -317,20 +328,18 @@ class _Surroundings:
         return jnp.concatenate([rates, where, tracking_errors(self.output(z), self.setpoint)])
 
 
-def _linearize_controller(
-    loop: Loop, signal: Array, as_signal: Callable[[Array], Tracking], command: Array
-) -> tuple[tuple[Array, Array, Array, Array], Callable[[Array, Array], Array], Array]:
-    """Return the controller at rest with the command that holds the plant: (A, B, C, D), a function, and its memory.
+def controller_function(
+    loop: Loop, as_signal: Callable[[Array], Tracking]
+) -> tuple[Array, Callable[[Array, Array], tuple[Array, Array]]]:
+    """Return the controller's memory c at the start, and a function of c and the signal s.
 
-    The system is from its signal to its command. The function maps (signal, memory) to (rate or next memory, command).
+    It returns the memory after a sample, or its rate in continuous time; and the command.
     """
     controller, memory = loop.controller, loop.start().controller
     sampled = isinstance(controller, Sampled)
     inside, unravel = ravel_pytree(memory.held.inner if sampled else memory)
-    targets = len(jax.tree.leaves(as_signal(signal).target))
 
-    def compute(c: Array, s: Array) -> tuple[PyTree, Array]:
-        """Return the memory after a sample, or its rate in continuous time; and the command."""
+    def compute(c: Array, s: Array) -> tuple[Array, Array]:
         memory, tracking = unravel(c), as_signal(s)
         if not isinstance(controller, Sampled):
             rate = controller.flow(0.0, memory, tracking)
@@ -338,6 +347,20 @@ def _linearize_controller(
         clock = Clock(0.0, controller.period, 1, None, before=tracking)
         after, output = controller.compute_sample(clock, memory, tracking)
         return ravel_pytree(after)[0], _flatten(output)
+
+    return inside, compute
+
+
+def _linearize_controller(
+    loop: Loop, signal: Array, as_signal: Callable[[Array], Tracking], command: Array
+) -> tuple[tuple[Array, Array, Array, Array], Callable[[Array, Array], Array], Array]:
+    """Return the controller at rest with the command that holds the plant: (A, B, C, D), a function, and its memory.
+
+    The system is from its signal to its command. The function maps (signal, memory) to (rate or next memory, command).
+    """
+    sampled = isinstance(loop.controller, Sampled)
+    inside, compute = controller_function(loop, as_signal)
+    targets = len(jax.tree.leaves(as_signal(signal).target))
 
     def rest_residual(c: Array, s: Array = signal) -> Array:
         """Return a vector that is zero where the memory is at rest and the command holds the plant."""

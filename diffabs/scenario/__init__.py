@@ -1,7 +1,8 @@
 """Scenarios: TOML files to loops and tasks, and back.
 
 Exports `load`, `loads`, `dump`, `names`, `Scenario`, `ScenarioError`; a run by `simulate`, and a sample of a sweep by
-`load_sample`; proofs from the loop to the file and back: `prove_box`, `verify`, `Proof` and `Verification`.
+`load_sample`; proofs from the loop to the file and back: `prove_box`, `prove_frequency`, `verify`,
+`Proof`, `FrequencyProof` and `Verification`.
 """
 
 from typing import TYPE_CHECKING
@@ -9,6 +10,8 @@ from typing import TYPE_CHECKING
 from diffabs.host.exports import lazy_getattr
 
 if TYPE_CHECKING:
+    from diffabs.scenario.frequency_proofs import FrequencyProof as FrequencyProof
+    from diffabs.scenario.frequency_proofs import prove_frequency as prove_frequency
     from diffabs.scenario.proofs import Proof as Proof
     from diffabs.scenario.proofs import Verification as Verification
     from diffabs.scenario.proofs import prove_box as prove_box

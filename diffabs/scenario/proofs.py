@@ -28,9 +28,12 @@ from diffabs.robust.reach.certificate import FORMAT, certificate_document
 from diffabs.robust.reach.cover import BoxProof, RunClaim, cover_box
 from diffabs.robust.reach.equations import derive_equations
 from diffabs.robust.reach.extremes import ExtremeRuns, find_extreme_runs
+from diffabs.robust.reach.verification import FileVerdict
 from diffabs.scenario.scenario import Scenario, dump, loads
 
 BOX_PROOF = "box proof"  # kind of the documents that `Proof.save` writes
+FREQUENCY_PROOF = "frequency proof"  # kind of the documents that `FrequencyProof.save` writes
+BOX_SHARE = 0.01  # of the cells of a box, which `verify` checks by default
 MAX_PROOF_BYTES = 2**28  # of a file that is read; some million cells
 
 Progress = Callable[[str], None]
@@ -242,7 +245,7 @@ class Verification(NamedTuple):
 def verify(
     path: str | os.PathLike[str],
     *,
-    share: float = 0.01,
+    share: float | None = None,
     seconds: float = MAX_SECONDS,
     progress: Progress = lambda line: None,
     processes: int = 1,
@@ -250,8 +253,8 @@ def verify(
     """Prove a saved proof again, by code that is independent of the code that made it.
 
     Args:
-        path: File of `Proof.save`, or certificate of `design` or `certify`.
-        share: Of a box: share of its cells to check, in (0, 1].
+        path: File of `Proof.save` or `FrequencyProof.save`, or certificate of `design` or `certify`.
+        share: Of a box: share of its cells to check, in (0, 1]; by default 0.01, and 1 of a proof over all frequencies.
         seconds: Of a certificate: limit of the computing time [s]; then nothing is proved.
         progress: Called with a line about how far the check is.
         processes: Number of processes that check cells at the same time.
@@ -264,16 +267,19 @@ def verify(
         `prove_box`: A proof that can be saved.
         `design.Certificate`: Certificates about linear models.
     """
-    document = read_proof_document(path)
+    document = read_proof_document(path, (BOX_PROOF, FREQUENCY_PROOF))
+    if document is not None and documents.kind_of(document) == FREQUENCY_PROOF:
+        return _verify_frequency_file(document, pathlib.Path(path).stem, 1.0 if share is None else share, progress)
     if document is not None:
+        share = BOX_SHARE if share is None else share
         return _verify_box_file(document, pathlib.Path(path).stem, share, progress, processes)
     verdicts = tuple(verify_file(path, seconds))
     reason = "; ".join(f"{verdict.kind}: {verdict.reason}" for verdict in verdicts if verdict.reason)
     return Verification(verdicts, True, reason if verdicts else "the file has no claims")
 
 
-def read_proof_document(path: str | os.PathLike[str]) -> JsonObject | None:
-    """Return the content of a file that `Proof.save` wrote, None for any other file.
+def read_proof_document(path: str | os.PathLike[str], kinds: Sequence[str] = (BOX_PROOF,)) -> JsonObject | None:
+    """Return the content of a file that `Proof.save` wrote, or of another of `kinds`; None for any other file.
 
     Raises:
         DocumentError: The file is of a version that this release does not read, or a document of another kind.
@@ -285,7 +291,7 @@ def read_proof_document(path: str | os.PathLike[str]) -> JsonObject | None:
     except (OSError, ValueError):
         return None
     kind = documents.kind_of(document)
-    if kind not in ("", BOX_PROOF):
+    if kind not in ("", *kinds):
         raise documents.DocumentError(
             f'format = "{document["format"]}" is no proof; "{FORMAT}" or "diffabs certificate" is needed'
         )
@@ -308,6 +314,22 @@ def _verify_box_file(document: JsonObject, name: str, share: float, progress: Pr
         scenario.loop, scenario.solver.duration, document, share,
         suspects=extremes.points, extremes=extremes.ranges, progress=progress, processes=processes,
     )  # fmt: skip
+    return _describe_cells(verdict, scenario, text, over)
+
+
+def _verify_frequency_file(document: JsonObject, name: str, share: float, progress: Progress) -> Verification:
+    """Check proofs over all frequencies."""
+    from diffabs.robust.frequency.certificate import read_frequency_file
+    from diffabs.scenario.frequency_proofs import verify_frequency_document
+
+    verdict, scenario, text = verify_frequency_document(document, name, share, progress)
+    return _describe_cells(verdict, scenario, text, read_frequency_file(document).over)
+
+
+def _describe_cells(
+    verdict: FileVerdict, scenario: Scenario, text: str, over: Mapping[str, tuple[float, float]]
+) -> Verification:
+    """Return the findings about a file whose cells were checked."""
     says = f"{verdict.checked:,} of {verdict.cells:,} cells proved again"
     whole = verdict.checked == verdict.cells
     says += "; --share 1 proves all" if not verdict.reason and not whole else ""

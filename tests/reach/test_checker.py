@@ -12,11 +12,12 @@ from mutants import killed_by
 from seams import replace_seam
 
 import diffabs as d
-from diffabs.robust.reach.equations import Equations, RealOperation, _Derivation, derive_equations
+from diffabs.robust.reach.equations import Derivation, Equations, RealOperation, derive_equations
 from diffabs.scenario.scenario import load
 
 flint = pytest.importorskip("flint")
 checker = pytest.importorskip("diffabs.robust.reach.checker")
+balls = pytest.importorskip("diffabs.robust.reach.balls")
 arb, check_cell, NotProved = flint.arb, checker.check_cell, checker.NotProved
 
 LMI = ("slip-lmi", ["controller.low=0", "controller.high=9.03"])
@@ -107,8 +108,8 @@ def within(inner, outer):
 
 
 @killed_by("robust.reach.checker", "for y in (a, b, *inside)]", "for y in (a, b)]")
-@killed_by("robust.reach.checker", "return near + 0.0 if arb(near) >= high else nextafter(near, inf)", "return near")
-@killed_by("robust.reach.checker", "return arb(value, float(np.spacing(abs(value))))", "return arb(value)")
+@killed_by("robust.reach.balls", "return near + 0.0 if arb(near) >= high else nextafter(near, inf)", "return near")
+@killed_by("robust.reach.balls", "return arb(value, float(np.spacing(abs(value))))", "return arb(value)")
 def test_the_balls_contain_the_intervals():
     """Sums of ends are compared in fractions; a limit lies within its chord; signs are kept."""
     draw = random.Random(1)
@@ -116,31 +117,31 @@ def test_the_balls_contain_the_intervals():
     for _ in range(2000):
         a, b = sorted((number(), number()))
         p, q = sorted((number(), number()))
-        x, y = checker._between(arb(a), arb(b)), checker._between(arb(p), arb(q))
+        x, y = balls.between(arb(a), arb(b)), balls.between(arb(p), arb(q))
         assert within((Fraction(a), Fraction(b)), ends(x))
         assert (a < 0 or ends(x)[0] >= 0) and (b > 0 or ends(x)[1] <= 0)  # noqa: PT018
-        assert within([Fraction(s) * Fraction(t) for s in (a, b) for t in (p, q)], ends(checker._product(x, y)))
+        assert within([Fraction(s) * Fraction(t) for s in (a, b) for t in (p, q)], ends(balls.product(x, y)))
         assert within(
-            [0, Fraction(a) * Fraction(0.3), Fraction(b) * Fraction(0.3)], ends(checker._integral_range(x, arb(0.3)))
+            [0, Fraction(a) * Fraction(0.3), Fraction(b) * Fraction(0.3)], ends(balls.integral_range(x, arb(0.3)))
         )
-        assert within([Fraction(s) for s in (a, b, p, q)], ends(checker._hull(x, y)))
+        assert within([Fraction(s) for s in (a, b, p, q)], ends(balls.hull(x, y)))
         if max(a, p) <= min(b, q):
-            assert within([Fraction(max(a, p)), Fraction(min(b, q))], ends(checker._common(x, y)))
+            assert within([Fraction(max(a, p)), Fraction(min(b, q))], ends(balls.common(x, y)))
         low, high = sorted((number(), number()))
         low, high = draw.choice([(None, high), (low, None), (low, high)])
         chord = checker._relax(x, None if low is None else arb(low), None if high is None else arb(high))
         for argument in (a, b, draw.uniform(a, b)):
             limited = argument if low is None else max(argument, low)
             limited = Fraction(limited if high is None else min(limited, high))
-            rest = ends(chord.offset + checker._symmetric(chord.width))
+            rest = ends(chord.offset + balls.symmetric(chord.width))
             assert within([limited - exact(chord.slope) * Fraction(argument)], rest)
             assert within([limited], ends(chord.limited))
             assert within([limited], ends(chord.values))
     for value in (0.1, 2.1, 1e-300, 13.88888888888889):
-        assert within([Fraction(value), Fraction(repr(value))], ends(checker._constant(value)))
+        assert within([Fraction(value), Fraction(repr(value))], ends(balls.constant(value)))
         with flint.ctx.workprec(checker.PRECISION):
             third = arb(value) / 3
-            low, high = checker._below(third), checker._above(third)
+            low, high = balls.below(third), balls.above(third)
             assert ends(third)[0] >= Fraction(low)
             assert ends(third)[1] <= Fraction(high)
 
@@ -177,7 +178,7 @@ def test_a_logistic_equation_is_enclosed(cell, width):
     assert bounds.lower["x"] <= cell[0]
 
 
-@killed_by("robust.reach.checker", "return [_symmetric(x) for x in moved], slack", "return [ZERO] * n, slack")
+@killed_by("robust.reach.checker", "return [balls.symmetric(x) for x in moved], slack", "return [ZERO] * n, slack")
 @killed_by("robust.reach.checker", "y = y + _along(*self.seeds[i])", "pass")
 @killed_by(
     "robust.reach.checker", "if all(b.contains(m) for b, m in zip(box, moved, strict=True)) and all(", "if True or all("
@@ -302,7 +303,11 @@ def test_a_horizon_ends_the_proof_early():
 
 
 @killed_by("robust.reach.checker", "y += j * u[j] * g[k - j]", "pass")
-@killed_by("robust.reach.checker", "return _power(x, value(o.args[2]))", "return _power(x.mid(), value(o.args[2]))")
+@killed_by(
+    "robust.reach.checker",
+    "return balls.positive_power(x, value(o.args[2]))",
+    "return balls.positive_power(x.mid(), value(o.args[2]))",
+)
 @pytest.mark.parametrize("name", ["exp", "log", "sin", "atan", "power", "inv"])
 @pytest.mark.parametrize(("cell", "width"), [((0.5, 0.5), 1e-7), ((0.5, 0.54), 3e-2)])
 def test_functions_are_enclosed(name, cell, width):
@@ -376,7 +381,7 @@ RISING = {  # a function f, c and x of about the same slopes c and f'(x): a wron
 def test_a_function_has_its_own_derivative(name):
     """x' = 0, x(0) = p, and the distance is that of c x + f(x) over 1 s; the derivative is that of the equations."""
     c, centre, function = RISING[name]
-    derivation = object.__new__(_Derivation)
+    derivation = object.__new__(Derivation)
     derivation.operations, derivation.indices = [], {}
     make, number = derivation.make, derivation.number
     x, time = make("state", (), 0), make("state", (), 2)
@@ -432,7 +437,9 @@ def growth(until):
 
 
 @killed_by(
-    "robust.reach.checker", "near if self.rates is None else {x: _hull(near[x], self.rates[x]) for x in near}", "near"
+    "robust.reach.checker",
+    "near if self.rates is None else {x: balls.hull(near[x], self.rates[x]) for x in near}",
+    "near",
 )
 def test_the_rates_of_all_ends_count():
     """The slowest run of a wide cell ends at a lower rate than the others, which have gone on, have then."""

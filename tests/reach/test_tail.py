@@ -306,8 +306,8 @@ def test_the_speed_is_no_settled_state(monkeypatch: pytest.MonkeyPatch, honest: 
 @killed_by("robust.reach.checker", "<= arb(piece.width[i]):", "<= arb(1):")
 @killed_by(
     "robust.reach.checker",
-    "y = q.centre + integral + _symmetric(q.uncertainty)",
-    "y = q.centre + _symmetric(q.uncertainty)",
+    "y = q.centre + integral + balls.symmetric(q.uncertainty)",
+    "y = q.centre + balls.symmetric(q.uncertainty)",
 )
 @pytest.mark.parametrize("speed", cases([1.1, 5.5], 1.1), ids=["too slow to settle", "settles"])
 def test_the_checker_bounds_runs_that_end_in_the_tail(speed: float) -> None:

@@ -32,14 +32,15 @@ third derivative at u = 0. A step of lower order does not ask for it, and the ch
 """
 
 from collections.abc import Iterable, Sequence
-from fractions import Fraction
-from math import inf, isfinite, nextafter
+from math import inf, isfinite
 from sys import float_info
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from flint import arb, arb_mat, arb_poly, ctx
 
+from diffabs.robust.reach import balls
+from diffabs.robust.reach.balls import NotProved as NotProved
 from diffabs.robust.reach.equations import LARGEST_INPUT, SLOWEST, Equations, RealOperation
 from diffabs.robust.reach.tail import RunTail, TailPiece, stop_speed
 
@@ -62,14 +63,6 @@ ZERO, ONE, NO_SLOPE = arb(0), arb(1), arb_poly([])
 
 
 Number = TypeVar("Number", arb, arb_poly)
-
-
-class NotProved(Exception):
-    """The checker cannot prove a bound of the cell; the message says why."""
-
-
-class _Undefined(Exception):
-    """A number has no value, or no such derivative, somewhere in a set."""
 
 
 class _StepFails(Exception):
@@ -103,84 +96,6 @@ class _Chord(NamedTuple):
     width: arb
     limited: arb
     values: arb
-
-
-# Balls.
-
-
-def _above(x: arb) -> float:
-    """Return a float that no number of a ball exceeds."""
-    high = x.upper()
-    near = float(high)
-    return near + 0.0 if arb(near) >= high else nextafter(near, inf)
-
-
-def _below(x: arb) -> float:
-    """Return a float that no number of a ball is below."""
-    return -_above(-x) + 0.0  # not -0.0
-
-
-def _symmetric(x: arb) -> arb:
-    """Return the ball around 0 that contains x and -x."""
-    return arb(0, x.abs_upper())
-
-
-def _between(low: arb, high: arb) -> arb:
-    """Return a ball that contains [low, high]; an end that is 0 stays exactly 0."""
-    low, high = low.lower(), high.upper()
-    ball = (low + high) / 2 + arb(0, ((high - low) / 2).upper())
-    if low >= 0:
-        return ball.nonnegative_part()
-    return -((-ball).nonnegative_part()) if high <= 0 else ball
-
-
-def _hull(x: arb, y: arb) -> arb:
-    return _between(min(x.lower(), y.lower()), max(x.upper(), y.upper()))
-
-
-def _common(x: arb, y: arb) -> arb:
-    """Return a ball that contains all numbers that lie in both of two balls."""
-    if y.contains(x):
-        return x
-    if x.contains(y):
-        return y
-    if not x.overlaps(y):
-        raise _Undefined("two enclosures of one number have nothing in common")
-    return _between(max(x.lower(), y.lower()), min(x.upper(), y.upper()))
-
-
-def _product(x: arb, y: arb) -> arb:
-    """Return a product; the radius of a ball is rounded up, which must not change the sign."""
-    z = x * y
-    if not z.contains(0) or z.is_zero():
-        return z
-    negative = (x.upper() <= 0, y.upper() <= 0)
-    if (negative[0] or x.lower() >= 0) and (negative[1] or y.lower() >= 0):
-        return z.nonnegative_part() if negative[0] == negative[1] else -((-z).nonnegative_part())
-    return z
-
-
-def _integral_range(rate: arb, h: arb) -> arb:
-    """Return a ball that contains t r for all t in [0, h] and all r of a rate."""
-    return _between(min(ZERO, (rate * h).lower()), max(ZERO, (rate * h).upper()))
-
-
-def _constant(value: float) -> arb:
-    """Return a ball that contains a double and the decimal number that its shortest text shows."""
-    value = float(value)
-    if not isfinite(value):
-        raise NotProved(f"the constant {value}")
-    if Fraction(repr(value)) == Fraction(value):
-        return arb(value)
-    return arb(value, float(np.spacing(abs(value))))
-
-
-def _power(base: arb, exponent: arb) -> arb:
-    """Return base^exponent for exponent > 0; the operation means 0 where the base is negative."""
-    if not exponent.lower() > 0:
-        raise _Undefined("a power whose exponent is not positive")
-    low, high = base.lower(), base.upper()
-    return _between((low**exponent).lower() if low > 0 else ZERO, (high**exponent).upper() if high > 0 else ZERO)
 
 
 # The operations, on power series.
@@ -318,7 +233,7 @@ class _Series:
             # The program computes the value itself, but no further coefficient, in doubles.
             largest = inf if coefficients else LARGEST_INPUT if name in ("state", "param") else float_info.max
             if not (x.is_finite() and x.abs_upper() < largest):
-                raise _Undefined(f"{name}: no finite value")
+                raise balls.Undefined(f"{name}: no finite value")
             coefficients.append(x)
         return coefficients[k]
 
@@ -338,14 +253,14 @@ class _Series:
 
     def width(self, i: int) -> arb:
         """Return the ball of all changes of operation i from the centre of the set, to first order."""
-        return sum((_symmetric(x) for x in self.slope(i).coeffs()), ZERO)
+        return sum((balls.symmetric(x) for x in self.slope(i).coeffs()), ZERO)
 
     def range(self, i: int) -> arb:
         """Return a ball with all values of operation i at the start, from the mean value theorem too."""
         x = self.value(i)
         if self.centre is None or self.program.static[i]:
             return x
-        return _common(x, self.centre.value(i) + self.width(i))
+        return balls.common(x, self.centre.value(i) + self.width(i))
 
     def truth(self, i: int) -> bool:
         """Return a condition that all numbers of the set decide alike."""
@@ -371,14 +286,14 @@ class _Series:
             case _:
                 raise NotProved(f"{o.name}: no such condition")
         if not (yes or no):
-            raise _Undefined("a condition that the runs decide differently")
+            raise balls.Undefined("a condition that the runs decide differently")
         return yes
 
     def _value(self, i: int, k: int) -> arb:
         o, value, static = self.program.operations[i], self.value, self.program.static
         match o.name:
             case "const":
-                return _constant(o.value)
+                return balls.constant(o.value)
             case "param":
                 return self.parameters[o.value]
             case "state":
@@ -393,7 +308,7 @@ class _Series:
             case "mul":
                 a, b = o.args
                 if k == 0:
-                    y = _product(value(a), value(b))
+                    y = balls.product(value(a), value(b))
                     return y.nonnegative_part() if a == b and y.lower() < 0 else y
                 if static[a]:
                     return value(a) * value(b, k)
@@ -405,7 +320,7 @@ class _Series:
                 (a,) = o.args
                 if k == 0:
                     if value(a).contains(0):
-                        raise _Undefined("a division by a number that may be 0")
+                        raise balls.Undefined("a division by a number that may be 0")
                     return 1 / value(a)
                 x, y = self.values(a, k), self.v[i]
                 return -_dot(x, y, 1, k, k) * y[0]
@@ -415,12 +330,12 @@ class _Series:
                 return value(o.args[2 if self.truth(o.args[0]) else 1], k)
             case "meet":
                 x = value(o.args[0], k)
-                return x if k else _common(x, value(o.args[1]))
+                return x if k else balls.common(x, value(o.args[1]))
         if k == 0:
             x = value(o.args[0])
             match o.name:
                 case "power":
-                    return _power(x, value(o.args[2]))
+                    return balls.positive_power(x, value(o.args[2]))
                 case "exp":
                     return x.exp()
                 case "log":
@@ -440,7 +355,7 @@ class _Series:
 
     def _chord(self, i: int) -> _Chord:
         if i not in self.chords:
-            raise _Undefined("a limit of a number that has no value")
+            raise balls.Undefined("a limit of a number that has no value")
         return self.chords[i]
 
     def _limit(self, i: int, k: int) -> arb:
@@ -451,13 +366,13 @@ class _Series:
                 return chord.values
             x = self.value(a, k)
             # The limit has the slope 0 or 1 nearly everywhere, and the chord a slope between them.
-            return chord.slope * x if chord.width.is_zero() else _hull(ZERO, x)
+            return chord.slope * x if chord.width.is_zero() else balls.hull(ZERO, x)
         if chord.slope.is_zero():
             y = chord.offset if k == 0 else ZERO
         else:
             y = chord.slope * self.value(a, k) + (chord.offset if k == 0 else ZERO)
         if k == 0 and i in self.seeds:
-            y += _symmetric(chord.width)
+            y += balls.symmetric(chord.width)
         return y
 
     def _slope(self, i: int, k: int) -> arb_poly:
@@ -541,7 +456,7 @@ def _relax(x: arb, low: arb | None, high: arb | None) -> _Chord:
             a, b = max(a, low.lower()), max(b, low.upper())
         if high is not None:
             a, b = min(a, high.lower()), min(b, high.upper())
-        return _between(a, b)
+        return balls.between(a, b)
 
     a, b = x.lower(), x.upper()
     if low is not None and b <= low.lower():
@@ -557,7 +472,7 @@ def _relax(x: arb, low: arb | None, high: arb | None) -> _Chord:
     offset = (min(y.lower() for y in gaps) + max(y.upper() for y in gaps)) / 2
     offset = arb(float(offset.mid()))
     width = max((y - offset).abs_upper() for y in gaps).upper()
-    return _Chord(slope, offset, width, clamp(x), _hull(clamp(x), slope * x + offset + _symmetric(width)))
+    return _Chord(slope, offset, width, clamp(x), balls.hull(clamp(x), slope * x + offset + balls.symmetric(width)))
 
 
 def _remainder(series: _Series, rate: int, order: int) -> arb:
@@ -584,13 +499,17 @@ class _Quadrature:
         n = len(self.slopes)
         total = [arb(float(self.slopes[j])) + slopes[j] for j in range(n)]
         self.slopes = np.array([float(x.mid()) for x in total])
-        lost = sum((_symmetric(x - float(s)) for x, s in zip(total, self.slopes, strict=True)), ZERO)
-        lost += sum((_symmetric(slopes[j]) for j in range(n, len(slopes))), ZERO)
+        lost = sum((balls.symmetric(x - float(s)) for x, s in zip(total, self.slopes, strict=True)), ZERO)
+        lost += sum((balls.symmetric(slopes[j]) for j in range(n, len(slopes))), ZERO)
         self.centre += centre
-        self.uncertainty = (self.uncertainty + (lost + _symmetric(slack)).abs_upper()).upper()
+        self.uncertainty = (self.uncertainty + (lost + balls.symmetric(slack)).abs_upper()).upper()
 
     def box(self) -> arb:
-        return self.centre + sum((_symmetric(arb(float(s))) for s in self.slopes), ZERO) + _symmetric(self.uncertainty)
+        return (
+            self.centre
+            + sum((balls.symmetric(arb(float(s))) for s in self.slopes), ZERO)
+            + balls.symmetric(self.uncertainty)
+        )
 
 
 class _Capture(NamedTuple):
@@ -693,7 +612,10 @@ class _Check:
     def box(self, tangents: Sequence[arb_poly] | None = None) -> list[arb]:
         """Return a box that contains the set."""
         tangents = self.directions() if tangents is None else tangents
-        X = [c + sum((_symmetric(x) for x in t.coeffs()), ZERO) for c, t in zip(self.centre(), tangents, strict=True)]
+        X = [
+            c + sum((balls.symmetric(x) for x in t.coeffs()), ZERO)
+            for c, t in zip(self.centre(), tangents, strict=True)
+        ]
         s = self.slip
         if s >= 0 and X[s].lower() < 0:  # no run is there: see `stays_nonnegative`
             if self.c[s] < 0:
@@ -726,7 +648,7 @@ class _Check:
             try:
                 chords[i] = self.chord(whole, i, whole.range(self.program.operations[i].args[0]))
                 seeds[i] = (first + q, chords[i].width)
-            except _Undefined:
+            except balls.Undefined:
                 continue  # an error where the limit is needed
         return point, whole, chords
 
@@ -763,7 +685,7 @@ class _Check:
             centre[i]
             - c[i]
             + uncertainty[i]
-            + sum((_symmetric(slopes[i][j] - float(G[i, j])) for j in range(np_)), ZERO)
+            + sum((balls.symmetric(slopes[i][j] - float(G[i, j])) for j in range(np_)), ZERO)
             for i in range(n)
         ]
         # A state without any spread keeps its own axis, so that a torque of exactly 0 stays exactly 0.
@@ -779,10 +701,10 @@ class _Check:
             except ZeroDivisionError:
                 raise _StepFails("the axes have no inverse") from None
             for row, state in enumerate(spread):
-                size = _symmetric(sum((inverse[row, k] * E[i] for k, i in enumerate(spread)), ZERO))
+                size = balls.symmetric(sum((inverse[row, k] * E[i] for k, i in enumerate(spread)), ZERO))
                 for j in range(np_, np_ + columns):
-                    size += _symmetric(sum((inverse[row, k] * slopes[i][j] for k, i in enumerate(spread)), ZERO))
-                r[state] = arb(_above(size.abs_upper()))
+                    size += balls.symmetric(sum((inverse[row, k] * slopes[i][j] for k, i in enumerate(spread)), ZERO))
+                r[state] = arb(balls.above(size.abs_upper()))
         if not all(x.is_finite() for x in r):
             raise _StepFails("the set has no bounds")
         self.c, self.G, self.B, self.r = c, G, B, r
@@ -821,7 +743,7 @@ class _Check:
                     step = step + power
                 tick = matrix(p.tick)
                 total = np.maximum(np.abs(tick @ step), np.abs(step @ tick))  # a set is renewed after both
-        except _Undefined:
+        except balls.Undefined:
             return
         if np.isfinite(total).all():
             weights = _balance_matrix(total)
@@ -839,7 +761,7 @@ class _Check:
         """Move the set by h, in halves where a step fails."""
         try:
             self.step(h)
-        except (_StepFails, _Undefined) as reason:
+        except (_StepFails, balls.Undefined) as reason:
             if depth >= MAX_HALVINGS:
                 raise NotProved(f"{reason} at {float(self.elapsed.mid()):g}") from None
             self.advance(h / 2, depth + 1)
@@ -851,12 +773,12 @@ class _Check:
         X = self.box(tangents)
         box, chords, boxed = self.enclose(centre, X, tangents, h)
         self.stays_nonnegative(box, chords)
-        moved, failure = None, _Undefined("no order")
+        moved, failure = None, balls.Undefined("no order")
         for order in (self.order, *LOWER_ORDERS):
             try:
                 moved = self.taylor(centre, X, tangents, box, chords, order)
                 break
-            except _Undefined as reason:
+            except balls.Undefined as reason:
                 failure = reason
         if moved is None:
             raise failure
@@ -913,7 +835,7 @@ class _Check:
         for name, (low, high) in limits.items():
             self.top[name], self.bottom[name] = max(self.top[name], high), min(self.bottom[name], low)
         if ends:
-            self.rates = near if self.rates is None else {x: _hull(near[x], self.rates[x]) for x in near}
+            self.rates = near if self.rates is None else {x: balls.hull(near[x], self.rates[x]) for x in near}
         self.elapsed += h
         self.steps += 1
 
@@ -937,11 +859,11 @@ class _Check:
         ) -> tuple[list[arb], dict[int, arb], dict[int, _Chord], _Series]:
             chords = {i: self.chord(whole, i, x) for i, x in ranges.items()}
             series = self.whole(box, chords=chords, forced=True)
-            moved = [x + _integral_range(series.value(rate), h) for x, rate in zip(X, p.flow, strict=True)]
+            moved = [x + balls.integral_range(series.value(rate), h) for x, rate in zip(X, p.flow, strict=True)]
             if s >= 0:
                 moved[s] = moved[s].nonnegative_part() if moved[s].lower() < 0 else moved[s]
             argument = {
-                i: series.value(a) if i in nested else at_start[i] + _integral_range(series.value(a, 1), h)
+                i: series.value(a) if i in nested else at_start[i] + balls.integral_range(series.value(a, 1), h)
                 for i, a in arguments.items()
             }
             return moved, argument, chords, series
@@ -953,10 +875,12 @@ class _Check:
                 ranges[i].contains(argument[i]) for i in ranges
             ):
                 break
-            box = [b if b.contains(m) else _wider(_hull(b, m)) for b, m in zip(box, moved, strict=True)]
+            box = [b if b.contains(m) else _wider(balls.hull(b, m)) for b, m in zip(box, moved, strict=True)]
             if s >= 0:
                 box[s] = box[s].nonnegative_part() if box[s].lower() < 0 else box[s]
-            ranges = {i: x if x.contains(argument[i]) else _wider(_hull(x, argument[i])) for i, x in ranges.items()}
+            ranges = {
+                i: x if x.contains(argument[i]) else _wider(balls.hull(x, argument[i])) for i, x in ranges.items()
+            }
         else:
             raise _StepFails("no box holds the runs of a step")
         # The image holds the runs as well. Where it proves itself once more, its chords are narrower.
@@ -968,7 +892,8 @@ class _Check:
             ranges, chords = narrower, new_chords
         series = self.whole(narrow, chords=chords, forced=True)
         box = [
-            _common(x + _integral_range(series.value(rate), h), b) for x, rate, b in zip(X, p.flow, narrow, strict=True)
+            balls.common(x + balls.integral_range(series.value(rate), h), b)
+            for x, rate, b in zip(X, p.flow, narrow, strict=True)
         ]
         if s >= 0 and box[s].lower() < 0:
             box[s] = box[s].nonnegative_part()
@@ -1047,8 +972,8 @@ class _Check:
         for i in (*p.signals.values(), *(q.rate for q in (self.travelled, self.clock) if q is not None)):
             x = series.slope(i)
             moves = sum((y * d for y, d in zip(largest(x, 0, n), D, strict=True)), ZERO)
-            slack[i] = _symmetric(moves + sum(largest(x, n, n + len(crossed)), ZERO))
-        return [_symmetric(x) for x in moved], slack
+            slack[i] = balls.symmetric(moves + sum(largest(x, n, n + len(crossed)), ZERO))
+        return [balls.symmetric(x) for x in moved], slack
 
     def signal_bounds(
         self, point: _Series, whole: _Series, far: _Series, boxed: _Series, h: arb, order: int, slack: dict[int, arb]
@@ -1062,7 +987,7 @@ class _Check:
                 try:
                     a, b = self.polynomial_bounds(point, whole, far, i, h, order, slack.get(i, ZERO))
                     low, high = max(low, a), min(high, b)
-                except _Undefined:
+                except balls.Undefined:
                     pass  # the box bounds the signal
             bounds[name] = low, high
         return bounds
@@ -1076,17 +1001,17 @@ class _Check:
         """
         values = [point.value(i, k) for k in range(order)]
         slopes = [whole.slope(i, k) for k in range(order)]
-        every = [v + sum((_symmetric(x) for x in s.coeffs()), ZERO) for v, s in zip(values, slopes, strict=True)]
+        every = [v + sum((balls.symmetric(x) for x in s.coeffs()), ZERO) for v, s in zip(values, slopes, strict=True)]
         rates = [k * every[k] for k in range(1, order)] or [ZERO]
         remainder = far.value(i, order)
         lows, highs = [], []
         for piece in range(PIECES):
-            t = _between(h * piece / PIECES, h * (piece + 1) / PIECES)
+            t = balls.between(h * piece / PIECES, h * (piece + 1) / PIECES)
             middle = t.mid()
-            y = _at(values, middle) + sum((_symmetric(x) for x in _at(slopes, middle).coeffs()), ZERO)
+            y = _at(values, middle) + sum((balls.symmetric(x) for x in _at(slopes, middle).coeffs()), ZERO)
             y += _at(rates, t) * (t - middle) + remainder * t**order + slack
             if not y.is_finite():
-                raise _Undefined("a signal without bounds")
+                raise balls.Undefined("a signal without bounds")
             lows.append(y.lower())
             highs.append(y.upper())
         return min(lows), max(highs)
@@ -1102,7 +1027,7 @@ class _Check:
             for i in p.tick:
                 whole.value(i)
             self.renew(after, slopes, [ZERO] * self.n, extra=len(p.tick_limits))
-        except (_Undefined, _StepFails) as reason:
+        except (balls.Undefined, _StepFails) as reason:
             raise NotProved(f"{reason} at a tick at {float(self.elapsed.mid()):g}") from None
 
     # The end.
@@ -1119,7 +1044,7 @@ class _Check:
             series = self.at_ends()
             whole, slopes = series.range(margin), series.slope(margin)
             middle = self.point(self.centre()).value(margin)
-        except _Undefined as reason:
+        except balls.Undefined as reason:
             raise NotProved(f"the margin: {reason}") from None
         if self.capture is None and middle.mid() <= 0:
             self.capture = _Capture(
@@ -1142,12 +1067,12 @@ class _Check:
         alpha, pace = inverse.mid(), rate.mid()
         later = alpha * margin.margin + (inverse - alpha) * margin.whole  # without the slopes of the margin
         slopes = margin.slopes * alpha
-        whole = later + sum((_symmetric(x) for x in slopes.coeffs()), ZERO)
-        y = q.centre + _symmetric(q.uncertainty) + pace * later + (rate - pace) * whole
+        whole = later + sum((balls.symmetric(x) for x in slopes.coeffs()), ZERO)
+        y = q.centre + balls.symmetric(q.uncertainty) + pace * later + (rate - pace) * whole
         for j in range(max(self.np, len(slopes))):
             slope = arb(float(q.slopes[j])) if j < self.np else ZERO
-            y += _symmetric(slope + pace * slopes[j])
-        return _below(y), _above(y)
+            y += balls.symmetric(slope + pace * slopes[j])
+        return balls.below(y), balls.above(y)
 
     # The tail.
 
@@ -1203,21 +1128,21 @@ class _Check:
         p, e = self.program, self.program.equations
         states = [ZERO] * self.n
         for name, ends in piece.later_states.items():
-            states[p.place[e.states.index(name)]] = _between(arb(ends[0]), arb(ends[1]))
+            states[p.place[e.states.index(name)]] = balls.between(arb(ends[0]), arb(ends[1]))
         states[self.speed] = speed
         a = -self.whole(states).value(e.acceleration)
         if not a.lower() > 0:
-            raise _Undefined("a settled run may not slow down")
+            raise balls.Undefined("a settled run may not slow down")
         return 1 / a
 
     def settled_bounds(self, piece: TailPiece) -> CheckedBounds:
         """Return the bounds of runs that are in a piece: each passes every speed down to the stop once."""
         end, v = stop_speed(self.program.equations), self.speed
         assert end is not None
-        stop, above, time, way = _constant(end), arb(self.c[v]), ZERO, ZERO
+        stop, above, time, way = balls.constant(end), arb(self.c[v]), ZERO, ZERO
         for k in range(1, SLICES + 1):
             lower = arb(self.c[v] * (end / self.c[v]) ** (k / SLICES)) if k < SLICES else stop
-            inverse = self.inverse_deceleration(piece, _hull(above, lower))
+            inverse = self.inverse_deceleration(piece, balls.hull(above, lower))
             time += (above - lower) * inverse
             way += (above - lower) * (above + lower) / 2 * inverse
             above = lower
@@ -1227,18 +1152,18 @@ class _Check:
         def total(q: _Quadrature | None, integral: arb, rate: arb) -> tuple[float, float]:
             if q is None:
                 return -inf, inf
-            y = q.centre + integral + _symmetric(q.uncertainty)
+            y = q.centre + integral + balls.symmetric(q.uncertainty)
             for j in range(self.np):
-                y += _symmetric(arb(float(q.slopes[j])) + rate * arb(float(self.G[v, j])))
+                y += balls.symmetric(arb(float(q.slopes[j])) + rate * arb(float(self.G[v, j])))
             for j in range(self.n):
-                y += _symmetric(rate * arb(float(self.B[v, j])) * self.r[j])
-            return _below(y), _above(y)
+                y += balls.symmetric(rate * arb(float(self.B[v, j])) * self.r[j])
+            return balls.below(y), balls.above(y)
 
         return CheckedBounds(
             total(self.time(), time, per_speed),
             total(self.travelled, way, per_speed * speeds),
-            {name: max(_above(x), piece.later_signals[name][1]) for name, x in self.top.items()},
-            {name: min(_below(x), piece.later_signals[name][0]) for name, x in self.bottom.items()},
+            {name: max(balls.above(x), piece.later_signals[name][1]) for name, x in self.top.items()},
+            {name: min(balls.below(x), piece.later_signals[name][0]) for name, x in self.bottom.items()},
         )
 
     def end_in_tail(self, tail: RunTail | None, latest: float) -> CheckedBounds | None:
@@ -1248,18 +1173,18 @@ class _Check:
             return None
         try:
             bounds = self.settled_bounds(piece)
-        except _Undefined:
+        except balls.Undefined:
             return None
         return bounds if bounds.stop_time[1] <= latest else None
 
     def bounds(self, ended: bool) -> CheckedBounds:
         """Return the bounds; up to the horizon only, unless the runs ended."""
         capture, rates = self.capture, self.rates
-        greatest = {name: _above(x) for name, x in self.top.items()}
-        smallest = {name: _below(x) for name, x in self.bottom.items()}
+        greatest = {name: balls.above(x) for name, x in self.top.items()}
+        smallest = {name: balls.below(x) for name, x in self.bottom.items()}
         if not ended or capture is None or rates is None:
-            low = _below(self.travelled.box()) if self.travelled else -inf
-            return CheckedBounds((_below(self.time().box()), inf), (low, inf), greatest, smallest)
+            low = balls.below(self.travelled.box()) if self.travelled else -inf
+            return CheckedBounds((balls.below(self.time().box()), inf), (low, inf), greatest, smallest)
         return CheckedBounds(
             self.at_zero(capture.clock, rates["clock"]),
             self.at_zero(capture.travelled, rates["travelled"]),
@@ -1329,7 +1254,7 @@ def check_cell(
         if tail is not None:
             check.check_tail(tail)
         return _prove(check, steps, horizon, tail, horizon if latest is None else latest)
-    except (_Undefined, _StepFails) as reason:
+    except (balls.Undefined, _StepFails) as reason:
         raise NotProved(str(reason)) from None
     except RecursionError:
         raise NotProved("a chain of too many operations, each of which reads the one before") from None
@@ -1345,7 +1270,7 @@ def _prove(
     if e.period is not None:
         if not isinstance(steps, int) or steps < 1:
             raise NotProved("a sampled loop needs a number of steps between two ticks")
-        period, tick = _constant(e.period), 0
+        period, tick = balls.constant(e.period), 0
         while True:
             if tick % BALANCE_INTERVAL == 0:
                 check.balance(e.period)

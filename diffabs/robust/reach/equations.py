@@ -252,17 +252,19 @@ def derive_equations(loop: Loop, over: Iterable[str]) -> Equations:
         raise NoRule(str(error)) from None
     try:
         with jax.enable_x64(True):
-            return _Derivation(loop, paths).equations()
+            return Derivation(loop, paths).equations()
     except RecursionError as error:
         raise NoRule("the loop has too long a chain of operations, each of which reads the one before") from error
 
 
-class _Derivation:
+class Derivation:
     """The derivation of the equations of one loop: a graph, and the operations that it becomes."""
 
     def __init__(self, loop: Loop, paths: tuple[str, ...]):
+        """Make an input of each parameter at `paths`. Raises NoRule for a path without a rule."""
         self.loop = jax.tree.map(lambda x: np.asarray(x, float) if np.asarray(x).dtype.kind == "f" else x, loop)
         self.paths, self.graph = paths, RealGraph()
+        self.period: float | None = None
         values = {path: value for path, _, value in parameters(self.loop)}
         for path in paths:
             if path not in values:
@@ -271,14 +273,13 @@ class _Derivation:
                 raise NoRule(f"{path} is a list; a proof varies single numbers")
             if path.split(".")[0] in BLOCKS and path.split(".")[-1] in ("period", "delay"):
                 raise NoRule(f"{path}: the proof has no rule for a range of periods or delays")
-        self.period = _clock_of(self.loop)
         self.parameter_nodes = [
             self.graph.input(np.float64, UpdateLevel.UNIFORM, (PARAM, i)) for i in range(len(paths))
         ]
         state = loop.start().plant
         fields = set(getattr(state, "_fields", ()))
         self.charted = loop.plant.shows is BrakeOutput and isinstance(loop.initial, BrakeStart)
-        self.charted &= "distance" in fields and len(fields) == len(_Chart._fields)
+        self.charted &= "distance" in fields and len(fields) == len(Chart._fields)
         self.operations: list[RealOperation] = []
         self.indices: dict[Any, int] = {}
         self.converted: dict[Any, dict[int, int]] = {}
@@ -309,6 +310,7 @@ class _Derivation:
 
     def equations(self) -> Equations:
         """Return the equations; the states are those of the loop's memory, in its order, then the time."""
+        self.period = _clock_of(self.loop)
         start, rates, after, show = self.programs()
         first = jax.eval_shape(self.chart, self.loop)
         shown, structure = jax.tree_util.tree_leaves_with_path(first), jax.tree.structure(first)
@@ -337,11 +339,11 @@ class _Derivation:
         signal_names = [*self.loop.plant.shows._fields, "target", "command", "control", "setpoint"]
         if not (len(begun) == len(moved) == n and len(shows) == len(signal_names) + 1):
             raise NoRule("a memory whose rate has another shape, or a signal that is no single number")
-        slip, speed, travelled = chart = [names.index(f"plant.{x}") if self.charted else -1 for x in _Chart._fields]
+        slip, speed, travelled = chart = [names.index(f"plant.{x}") if self.charted else -1 for x in Chart._fields]
         if self.charted:
             plant_nodes = self.lower(lambda loop, z: flat(self.loop_state(loop, state_of(z[:-1])).plant), nodes)
             rates_of_own = [moved[i] for i in sorted(chart)]
-            shown_rates = self.chart_rates(plant_nodes, rates_of_own, _Chart(*(nodes[i] for i in chart)))
+            shown_rates = self.chart_rates(plant_nodes, rates_of_own, Chart(*(nodes[i] for i in chart)))
             for i, rate in zip(chart, shown_rates, strict=True):
                 moved[i] = rate
         # The slip and the speed that the plant computes from its own states are the states of the chart.
@@ -418,7 +420,7 @@ class _Derivation:
 
         return self.chart, rates, after, show
 
-    def chart_rates(self, plant_nodes: list[Node], rates: list[Node], chart: "_Chart") -> list[Node]:
+    def chart_rates(self, plant_nodes: list[Node], rates: list[Node], chart: "Chart") -> list[Node]:
         """Return the rates of slip, speed and distance from those of the plant's own states.
 
         The graph of the speeds v and w in the plant's output is differentiated here. A derivative that a part declares
@@ -443,7 +445,7 @@ class _Derivation:
         if not self.charted:
             return state
         y = loop.plant.output(state.plant)
-        return state._replace(plant=_Chart(y.slip, y.speed, state.plant.distance))
+        return state._replace(plant=Chart(y.slip, y.speed, state.plant.distance))
 
     def initial_node(self, name: str) -> Node:
         path = f"initial.{name}"
@@ -659,7 +661,7 @@ class _Derivation:
         return self.make("select", (condition, no, yes))
 
 
-class _Chart(NamedTuple):
+class Chart(NamedTuple):
     """The states of a braked wheel in a proof: slip [1], speed [m/s], distance [m]."""
 
     slip: Node

@@ -1,0 +1,142 @@
+"""Proofs over all frequencies and a box, from the loop to the file: prove and save; `proofs.verify` checks the file.
+
+proof = prove_frequency(loop, {"plant.mass": (5.3, 6.2)}, [FrequencyClaim(1.7)])
+proof.save("sensitivity.proof")
+"""
+
+import dataclasses
+import os
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+
+from diffabs.core.types import JsonObject
+from diffabs.engine.solvers import FixedStep
+from diffabs.host import documents, files
+from diffabs.loop.closed_loop import Loop
+from diffabs.parts.objectives import default_objectives
+from diffabs.robust.frequency.certificate import frequency_document, verify_frequency
+from diffabs.robust.frequency.opened import derive_opened
+from diffabs.robust.frequency.sensitivity import (
+    FrequencyClaim,
+    Place,
+    SensitivityProof,
+    check_frequency_claim,
+    prove_claim,
+)
+from diffabs.robust.reach.cover import check_box
+from diffabs.robust.reach.verification import FileVerdict
+from diffabs.scenario.scenario import Scenario, dump, loads
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FrequencyProof:
+    """What is proved of claims about a loop over a box.
+
+    Attributes:
+        loop: Loop.
+        over: Range (low, high) of each parameter, by path, in SI units.
+        target: Setpoint; None for the loop's own.
+        proofs: Proof of each claim.
+    """
+
+    loop: Loop
+    over: Mapping[str, tuple[float, float]]
+    target: float | None
+    proofs: tuple[SensitivityProof, ...]
+
+    @property
+    def verdict(self) -> str:
+        """The verdict: refuted if a claim is, proved if all are, else undecided."""
+        verdicts = {proof.verdict for proof in self.proofs}
+        return "refuted" if "refuted" in verdicts else "proved" if verdicts == {"proved"} else "undecided"
+
+    @property
+    def reason(self) -> str:
+        """Why a claim is not proved; empty if all are."""
+        return "; ".join(f"{proof.claim}: {proof.reason}" for proof in self.proofs if proof.reason)
+
+    def record(self) -> JsonObject:
+        """Return verdicts and figures as JSON values, in SI."""
+        return {
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "over": {path: list(ends) for path, ends in self.over.items()},
+            "target": self.target,
+            "claims": [
+                {
+                    "claim": str(proof.claim),
+                    "verdict": proof.verdict,
+                    "reason": proof.reason,
+                    "worst": self._describe_place(proof.worst),
+                    "witness": self._describe_place(proof.witness),
+                    "cells": proof.cells,
+                    "tried": proof.tried,
+                    "seconds": proof.seconds,
+                }
+                for proof in self.proofs
+            ],
+        }
+
+    def _describe_place(self, place: Place | None) -> JsonObject | None:
+        if place is None:
+            return None
+        values = dict(zip(self.over, place.params, strict=True))
+        return {"sensitivity": place.sensitivity, "frequency": place.frequency, "added_delay": place.added, **values}
+
+    def save(self, path: str | os.PathLike[str], scenario: Scenario | None = None) -> None:
+        """Write the file from which `verify` proves the claims again, complete or not at all.
+
+        Args:
+            path: File to write.
+            scenario: Scenario of the loop, for its name and its other sections; by default one of the loop alone.
+        """
+        if scenario is None:
+            solver, measured = FixedStep(), default_objectives(self.loop.plant)
+            scenario = Scenario("loop", loop=self.loop, solver=solver, objectives=measured)
+        document = frequency_document(self.proofs, dump(scenario), self.over, self.target)
+        files.write_file(pathlib.Path(path), f"{documents.format_document(document, None)}\n".encode())
+
+
+def prove_frequency(
+    loop: Loop,
+    over: Mapping[str, tuple[float, float]],
+    claims: Sequence[FrequencyClaim],
+    *,
+    target: float | None = None,
+    budget: float = 60.0,
+    progress: Callable[[str], None] = lambda line: None,
+) -> FrequencyProof:
+    """Return what can be proved of claims about a loop over a box and all frequencies.
+
+    Args:
+        loop: Loop with one control.
+        over: Range (low, high) of each parameter of the box, by path, in SI units.
+        claims: Statements to decide.
+        target: Setpoint; None for the loop's own.
+        budget: Computing time for each claim [s].
+        progress: Called with a line about how far a proof is.
+
+    Raises:
+        ValueError: A number is out of its range, or the loop has no linear model at the middle of the box.
+        NoRule: A part, an operation or a parameter of the loop has no sound rule.
+
+    See also:
+        `robust.frequency.prove_sensitivity`: One proof, with the method and an example.
+    """
+    for claim in claims:
+        check_frequency_claim(claim)
+    check_box(over)
+    equations = derive_opened(loop, dict(over), target)
+    proofs = [prove_claim(equations, over, claim, budget=budget, progress=progress) for claim in claims]
+    return FrequencyProof(loop, over, target, tuple(proofs))
+
+
+def verify_frequency_document(
+    document: JsonObject, name: str, share: float, progress: Callable[[str], None]
+) -> tuple[FileVerdict, Scenario, str]:
+    """Return the findings about a file's document, its scenario and the text of that."""
+    text = document.get("scenario")
+    if not isinstance(text, str):
+        raise ValueError("scenario is missing or no text; the TOML text of a scenario is needed")
+    scenario = loads(text.encode(), name, "scenario", integrated=False)
+    return verify_frequency(scenario.loop, document, share, progress), scenario, text
