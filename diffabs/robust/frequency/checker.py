@@ -24,10 +24,10 @@ from diffabs.robust.reach import balls
 from diffabs.robust.reach.balls import NotProved, Undefined
 
 PRECISION = 96  # bits
-NEWTON_STEPS = 12
+REST_STEPS = 12
 REST_TRIES = 8
 GROWTH = arb("1.3")
-CELL_HALVINGS = 8
+EXTRA_HALVINGS = 10
 TURN_HALVINGS = 60  # of the frequencies, for the poles at one point
 TURN_PARTS = 24
 
@@ -91,7 +91,7 @@ class LoopChecker:
             self.boxes[box] = self._coefficients([balls.between(arb(a), arb(b)) for a, b in box])
         return self.boxes[box]
 
-    def check_cell(self, cell: Ends, halvings: int = CELL_HALVINGS) -> None:
+    def check_cell(self, cell: Ends, halvings: int = EXTRA_HALVINGS) -> None:
         """Prove f > 0 in a cell: a range of frequencies, then of each parameter. Raises NotProved."""
         with _precision():
             self._check(cell, halvings)
@@ -157,7 +157,7 @@ class LoopChecker:
         z = acb((w * period).cos(), (w * period).sin())
         return acb(-2 * half * half, (w * period).sin()), acb(0, 1) * period * z
 
-    def check_tail(self, box: Ends, top: float, halvings: int = CELL_HALVINGS) -> None:
+    def check_tail(self, box: Ends, top: float, halvings: int = EXTRA_HALVINGS) -> None:
         """Prove |L| < 1 - 1/M over a box for all frequencies of at least `top` [rad/s]. Raises NotProved."""
         with _precision():
             try:
@@ -195,7 +195,7 @@ class LoopChecker:
             raise NotProved(f"the loop at the middle of the box has {float(unstable.mid()):.3g} unstable poles")
 
     def _count_unstable(self, c: _Coefficients, top: float) -> arb:
-        def closed(w: arb) -> acb:
+        def difference(w: arb) -> acb:
             s, _ = self._variable(w)
             p, b = (sum((x.value * s**k for k, x in enumerate(y)), acb(0)) for y in (c.poles, c.zeros))
             return p + b * (acb(0, -1) * w * c.delay.value).exp()
@@ -204,17 +204,17 @@ class LoopChecker:
         turned, stack = arb(0), [(low, high, 0) for low, high in pairwise(edges)]
         while stack:
             low, high, depth = stack.pop()
-            around = closed(balls.between(arb(low), arb(high)))
+            around = difference(balls.between(arb(low), arb(high)))
             if around.real.contains(0) and around.imag.contains(0):
                 if depth > TURN_HALVINGS:
                     raise Undefined("a pole on the stability limit")
                 middle = 0.5 * (low + high)
                 stack += [(low, middle, depth + 1), (middle, high, depth + 1)]
             else:  # a rectangle without 0 lies in a half plane, so the angle turns by less than pi
-                turned += (closed(arb(high)) / closed(arb(low))).arg()
+                turned += (difference(arb(high)) / difference(arb(low))).arg()
         n, pi = len(c.poles) - 1, arb.pi()
         if self.equations.period is None:
-            turned -= (closed(arb(top)) / acb(0, 1) ** n).arg()
+            turned -= (difference(arb(top)) / acb(0, 1) ** n).arg()
             return (n - 2 * turned / pi) / 2
         return n - turned / pi
 
@@ -249,11 +249,11 @@ class LoopChecker:
     def _sample(self, a: Any, b: Any, c: Any, rest: _Number | None) -> tuple[Any, Any, Any]:
         """Return the sampled plant (A - I, B, C); behind the rest of a delay the inputs are u and s u, a period old."""
         n, zero = len(a), _Number(arb(0), [arb(0)] * self.count)
-        one = _Number(arb(1), zero.slopes)
+        unit = _Number(arb(1), zero.slopes)
         generator = [[*a[i], b[i][0]] for i in range(n)] + [[zero] * (n + 1)]
         period = _Number(balls.constant(self.equations.period or 0.0), zero.slopes)
         whole = self._exponential(generator, period)
-        inner = [[whole[i][k].plus(one.negative()) if i == k else whole[i][k] for k in range(n)] for i in range(n)]
+        inner = [[whole[i][k].plus(unit.negative()) if i == k else whole[i][k] for k in range(n)] for i in range(n)]
         inputs = [[whole[i][n]] for i in range(n)]
         if rest is not None:
             early = self._exponential(generator, period.plus(rest.negative()))
@@ -306,7 +306,7 @@ class LoopChecker:
         first, middle = self.count - 1, [x.mid() for x in params]
         y = [arb(x) for x in e.guess]
         inverse = np.eye(n)
-        for _ in range(NEWTON_STEPS):
+        for _ in range(REST_STEPS):
             values = _Operations(e, middle, y, self.constants)
             slopes = [values.slopes(e.rest[i]) for i in rows]
             inverse = np.linalg.inv([[float(row.get(first + k, arb(0)).mid()) for k in range(n)] for row in slopes])

@@ -44,7 +44,7 @@ Entry: TypeAlias = Jet | None  # None: 0 whatever the numbers are
 Entries: TypeAlias = list[list[Entry]]
 Polynomial: TypeAlias = list[Entry]
 Slopes: TypeAlias = dict[int, Enclosure]
-ONE = Jet(Enclosure(np.float64(1.0)))  # pyright: ignore
+ONE = Jet(Enclosure(np.float64(1.0)))
 
 
 class Coefficients(NamedTuple):
@@ -305,7 +305,7 @@ class _Evaluation:
         if name == "state":
             settled = self.equations.settled
             return values[settled[value]] if value in settled else unknown[self.places[value]]
-        x = [values[a] if a >= 0 else None for a in self._operands(i)] if name not in ("clamp", "inside") else []
+        x: list[Any] = [values[a] if a >= 0 else None for a in (self._operands(i) if name in FUNCTIONS else args)]
         match name:
             case "const":
                 return enclose_number(value)
@@ -336,7 +336,7 @@ class _Evaluation:
             case "power":
                 return enclose_power(x[0], x[1])
             case "clamp" | "inside":
-                return _limit(name, *(None if a < 0 else values[a] for a in args))
+                return _limit(name, *x)
             case "select":
                 return _select(*x)
             case "lt" | "le" | "eq" | "ne":
@@ -355,7 +355,7 @@ class _Evaluation:
         name, args, value = self.equations.operations[i]
         if name == "param" or (name == "state" and value not in self.equations.settled):
             k = value if name == "param" else params + self.places[value]
-            return {k: Enclosure(np.float64(1.0))} if k in variables else {}  # pyright: ignore
+            return {k: Enclosure(np.float64(1.0))} if k in variables else {}
         operands = self._operands(i)
         d = [slopes.get(a, {}) for a in operands]
         if not any(d):
@@ -377,18 +377,18 @@ class _Evaluation:
                 factor = -values[i].square()
                 return {k: factor * x for k, x in d[0].items()}
             case "clamp":
-                inside = _limit("inside", *(None if a < 0 else values[a] for a in args))
+                inside = _limit("inside", values[args[0]], *(None if a < 0 else values[a] for a in args[1:]))
                 moved = any(slopes.get(a) for a in args[1:])
-                unknown = Enclosure(np.float64(np.nan))  # pyright: ignore
+                unknown = Enclosure(np.float64(np.nan))
                 return {k: unknown if moved else inside * x for k, x in d[0].items()}
             case "select":
-                zero = Enclosure(np.float64(0.0))  # pyright: ignore
+                zero = Enclosure(np.float64(0.0))
                 yes, no = values[args[0]]
                 valid = np.where(yes | no, 0.0, np.nan)
                 both = {k: (d[1].get(k, zero), d[2].get(k, zero)) for k in {**d[1], **d[2]}}
                 return {k: _select((yes, no), a, b) + Enclosure(valid) for k, (a, b) in both.items()}
             case "inside" | "round" | "lt" | "le" | "eq" | "ne" | "not" | "and" | "or":
-                valid = values[i] if name == "inside" else Enclosure(np.float64(np.nan))  # pyright: ignore
+                valid = values[i] if name == "inside" else Enclosure(np.float64(np.nan))
                 return {k: x * (valid - valid) for k, x in d[0].items()} if name in ("inside", "round") else {}
         raise AssertionError(name)
 
@@ -514,7 +514,7 @@ def _polynomials(plant: list[Entries], controller: list[Entries]) -> tuple[Polyn
     n, m = len(a), len(f)
     whole = [[*row, *([None] * m)] for row in a]
     whole += [[*_times([g[i]], c)[0], *f[i]] if n else [*f[i]] for i in range(m)]
-    into: list[Polynomial] = [*b, *([[None]] * m)]
+    into: list[Polynomial] = [*b, *([None] for _ in range(m))]
     out = [None if x is None else -x for x in (*(_times(j, c)[0]), *(h[0] if m else []))]
     observed = {i for i, x in enumerate(out) if x is not None}
     while more := {i for k in observed for i, x in enumerate(whole[k]) if x is not None} - observed:

@@ -7,6 +7,7 @@ NaN marks an interval that nothing is known of; every comparison with it is fals
 
 import math
 from fractions import Fraction
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -14,7 +15,7 @@ FUNCTION_ERROR = 4e-15  # of cos and sin, absolute, and of exp, log and atan, re
 LARGEST_ANGLE = 1e6  # beyond which cos is only known to lie in [-1, 1]
 ANGLE_SLACK = 1e-9  # of an angle, in which an extremum of cos counts as inside
 
-Ends = np.ndarray
+Ends: TypeAlias = Any  # arrays of NumPy, or its numbers
 
 
 def _down(x: Ends) -> Ends:
@@ -36,7 +37,7 @@ class Enclosure:
         self.high: Ends = low if high is None else high
 
     def __getitem__(self, index: object) -> "Enclosure":
-        return Enclosure(self.low[index], self.high[index])  # pyright: ignore
+        return Enclosure(self.low[index], self.high[index])
 
     def __neg__(self) -> "Enclosure":
         return Enclosure(-self.high, -self.low)
@@ -89,9 +90,9 @@ def enclose_number(value: float) -> Enclosure:
     """Return an interval of shape () that contains a double and the decimal that its shortest text shows."""
     x = np.float64(value)
     if not np.isfinite(x):
-        return Enclosure(np.float64(np.nan))  # pyright: ignore
+        return Enclosure(np.float64(np.nan))
     if Fraction(repr(float(value))) == Fraction(float(value)):
-        return Enclosure(x)  # pyright: ignore
+        return Enclosure(x)
     return Enclosure(_down(x), _up(x))
 
 
@@ -112,7 +113,7 @@ def widen(low: Ends, high: Ends, absolute: float, relative: float) -> Enclosure:
     return Enclosure(_down(low - (absolute + relative * np.abs(low))), _up(high + (absolute + relative * np.abs(high))))
 
 
-HALF_PI = Enclosure(np.float64(math.pi / 2), np.nextafter(math.pi / 2, 2.0))  # pyright: ignore
+HALF_PI = Enclosure(np.float64(math.pi / 2), np.nextafter(math.pi / 2, 2.0))
 
 
 def cosine(x: Enclosure) -> Enclosure:

@@ -149,7 +149,7 @@ class _OpenedDerivation(Derivation):
 
         def control(loop: Loop, memory: Sequence[Array], numbers: Sequence[Array]) -> list[Array]:
             compute = controller_function(split_off_delays(loop)[0], as_signal)[1]
-            after, command = compute(jnp.stack(memory) if memory else jnp.zeros(0), numbers)
+            after, command = compute(jnp.stack(memory) if memory else jnp.zeros(0), jnp.stack(numbers))
             return _flatten((after, command))
 
         moved, shown = self.lower(move, z, v), self.lower(show, z)
@@ -231,7 +231,8 @@ class _OpenedDerivation(Derivation):
 
     def derive(self, i: int, state: int, memory: dict[int, int]) -> int:
         """Return `tangent` from the operands."""
-        name, args, value = self.operations[i]
+        name, value = self.operations[i].name, self.operations[i].value
+        args: Any = self.operations[i].args
         if name in ("const", "truth", "param"):
             return NO_ENTRY
         if name == "state":
@@ -266,7 +267,7 @@ class _OpenedDerivation(Derivation):
             case "meet":
                 return along[0] if along[0] == along[1] or NO_ENTRY in along else self.make("meet", tuple(along))
             case "clamp" if along[1:] == [NO_ENTRY, NO_ENTRY]:
-                return NO_ENTRY if along[0] == NO_ENTRY else self.product(along[0], self.make("inside", args))
+                return NO_ENTRY if along[0] == NO_ENTRY else self.product(along[0], self.make("inside", tuple(args)))
         if name in FUNCTIONS:
             return self.product(args[1], along[0])
         raise NoRule(f"{name}: a proof has no derivative of it")

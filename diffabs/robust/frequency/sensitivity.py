@@ -20,6 +20,8 @@ none can come from infinity: N is s^n and terms of lower order, whatever the del
 M is infinite. A sampled loop has other polynomials after each whole period; the delays are cut there.
 """
 
+import contextlib
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,8 +41,12 @@ STRIPS = 24  # halvings of the frequencies before anything is tried; the last st
 CELLS_AT_ONCE = 1 << 14
 LEAST_SHARE = 2.0**-44  # of a side, relative to the box; such a cell is not halved
 TAIL_HALVINGS = 16
+MANY_CORNERS = 64  # at which the stability is tried
 HIGHEST = 1e12  # rad/s
 LEAF = "."
+
+# Ends of the added delay [s], whole periods in the delay, and whether it has a rest.
+DelayRange: TypeAlias = tuple[tuple[float, float], int, bool]
 
 Complex: TypeAlias = tuple[Enclosure | None, Enclosure | None]
 
@@ -206,10 +212,11 @@ class _Proof:
     ):  # fmt: skip
         self.equations, self.claim, self.until, self.progress = equations, claim, until, progress
         self.box = np.array([outer_ends(*ends) for ends in over.values()]).reshape(-1, 2)
+        self.inner = list(over.values())
         self.middle = [0.5 * (low + high) for low, high in over.values()]
         self.tried = self.cells = 0
         self.worst: Place | None = None
-        self.share = enclose_number(claim.bound).inverse() if math.isfinite(claim.bound) else Enclosure(np.float64(0.0))  # pyright: ignore
+        self.share = enclose_number(claim.bound).inverse() if math.isfinite(claim.bound) else Enclosure(np.float64(0.0))
 
     def conclude(self) -> SensitivityProof:
         """Return the proof."""
@@ -218,7 +225,9 @@ class _Proof:
         verdict, reason, witness = "undecided", "", None
         try:
             parts = list(delay_pieces(self.equations, self.claim.added))
-            self.check_stable(*parts[0])
+            self.check_stable(self.middle, 0.0, parts[0])
+            if math.isinf(self.claim.bound):
+                self.check_corners(parts)
             pieces += [self.cover(*part) for part in parts]
             verdict = "proved"
         except _Refuted as error:
@@ -232,11 +241,10 @@ class _Proof:
     def polynomials(self, whole: int, broken: bool) -> Polynomials:
         return Polynomials(self.equations, self.middle, whole, broken=broken)
 
-    def check_stable(self, delays: tuple[float, float], whole: int, broken: bool) -> None:
-        """Prove that the closed loop is stable at the middle of the box without an added delay."""
-        del delays
-        point = np.array([[*self.middle, 0.0]])
-        coefficients = self.polynomials(whole, broken).over(point, point, slopes=False)
+    def check_stable(self, params: Sequence[float], added: float, part: DelayRange) -> None:
+        """Count the unstable poles at a point; raise _Refuted for any, and _Open if that is undecided."""
+        point = np.array([[*params, added]])
+        coefficients = self.polynomials(*part[1:]).over(point, point, slopes=False)
         period = self.equations.period
         top = self.find_top(coefficients) if period is None else sampled_top(period)
         cells = [(0.0 if k == STRIPS else top * 2.0 ** -(k + 1), top * 2.0**-k) for k in range(STRIPS + 1)]
@@ -245,8 +253,8 @@ class _Proof:
             low, high = np.array(cells).T
             response = _respond(coefficients, Enclosure(low, high), period, np.zeros(len(low), int))
             clear = np.zeros(len(low), bool)
-            for part in response.closed:
-                clear |= part is not None and ((part.low > 0) | (part.high < 0))
+            for x in response.closed:
+                clear |= False if x is None else (x.low > 0) | (x.high < 0)
             done += [cell for cell, free in zip(cells, clear, strict=True) if free]
             halved = [cell for cell, free in zip(cells, clear, strict=True) if not free]
             if any(b - a < 1e-12 * top for a, b in halved) or time.monotonic() > self.until:
@@ -264,9 +272,19 @@ class _Proof:
         else:
             unstable = n - turned / math.pi
         if round(unstable) > 0:
-            raise _Refuted(
-                None, f"the loop is unstable at {self.name_params(self.middle, 0.0)}: {round(unstable)} poles"
-            )
+            where = self.name_params(params, added)
+            raise _Refuted(None, f"the loop is unstable where {where}: {round(unstable)} poles")
+
+    def check_corners(self, parts: Sequence[DelayRange]) -> None:
+        """Raise _Refuted if the loop is unstable at a corner of the box, with the least or the greatest added delay.
+
+        f < 0 holds nowhere if M is infinite, so a claim of stability alone has no other witness.
+        """
+        corners = itertools.product(*(sorted({*ends}) for ends in self.inner))
+        for corner in itertools.islice(corners, MANY_CORNERS):
+            for added, part in {0.0: parts[0], self.claim.added: parts[-1]}.items():
+                with contextlib.suppress(_Open):
+                    self.check_stable(corner, added, part)
 
     def find_top(self, coefficients: Coefficients) -> float:
         """Return a frequency above which a loop at a point has a small gain, with some reserve."""
@@ -285,12 +303,12 @@ class _Proof:
             total = Enclosure(np.zeros(1))
             for k, x in enumerate(polynomial):
                 if x is not None:
-                    falling = Enclosure(np.float64(1.0))  # pyright: ignore
+                    falling = Enclosure(np.float64(1.0))
                     for _ in range(n - k):
-                        falling = falling * Enclosure(np.float64(top)).inverse()  # pyright: ignore
+                        falling = falling * Enclosure(np.float64(top)).inverse()
                     total = total + Enclosure(x.value.size()) * falling
             sums.append(total)
-        unit = Enclosure(np.float64(1.0))  # pyright: ignore
+        unit = Enclosure(np.float64(1.0))
         reserve = (unit - self.share) * (unit - sums[0]) - sums[1]
         return reserve.low > 0
 
@@ -340,6 +358,7 @@ class _Proof:
         """Return a frequency above which the gain is small over the box, and the halvings that prove it."""
         middle = box.mean(1)[None]
         top = self.find_top(polynomials.over(middle, middle, slopes=False))
+        low, high = box[None, :, 0], box[None, :, 1]
         for _ in range(40):
             tree, low, high, nodes = _Tree(1), box[None, :, 0], box[None, :, 1], np.arange(1)
             for _ in range(TAIL_HALVINGS):
@@ -395,7 +414,7 @@ class _Proof:
         place = Place(float(middle[i, 0]), tuple(map(float, middle[i, 1:-1])), float(middle[i, -1]), float(ratio[i]))
         if self.worst is None or place.sensitivity > self.worst.sensitivity:
             self.worst = place if np.isfinite(place.sensitivity) else self.worst
-        wrong = f.high < 0
+        wrong = np.asarray(f.high < 0)
         if wrong.any():
             i = int(np.argmax(np.where(wrong & np.isfinite(at_least), at_least, -1.0)))
             witness = Place(
@@ -405,7 +424,7 @@ class _Proof:
             raise _Refuted(witness, f"|S| >= {witness.sensitivity:.6g} at {witness.frequency:.6g} rad/s where {where}")
 
     def describe_stuck(self, corner: np.ndarray) -> str:
-        where = self.name_params(corner[1:-1], corner[-1])
+        where = self.name_params(corner[1:-1].tolist(), float(corner[-1]))
         return (
             f"no bound near {corner[0]:.6g} rad/s where {where}: the rest, the limits or the bound are too close there"
         )
@@ -425,7 +444,7 @@ def sampled_top(period: float) -> float:
     return math.pi / period * (1 + 1e-12)
 
 
-def delay_pieces(equations: OpenedEquations, added: float) -> Iterator[tuple[tuple[float, float], int, bool]]:
+def delay_pieces(equations: OpenedEquations, added: float) -> Iterator[DelayRange]:
     """Yield ranges of the added delay with one set of polynomials, their whole periods, and whether a rest is left."""
     high = float(enclose_number(added).high)
     if equations.period is None:
@@ -667,12 +686,12 @@ def _multiply(x: Complex, y: Complex) -> Complex:
 def _inner(x: Complex, y: Complex) -> Enclosure:
     """Return Re(conj(x) y)."""
     terms = [a * b for a, b in zip(x, y, strict=True) if a is not None and b is not None]
-    return terms[0] + terms[1] if len(terms) == 2 else terms[0] if terms else Enclosure(np.float64(0.0))  # pyright: ignore
+    return terms[0] + terms[1] if len(terms) == 2 else terms[0] if terms else Enclosure(np.float64(0.0))
 
 
 def _square_modulus(x: Complex) -> Enclosure:
     parts = [part.square() for part in x if part is not None]
-    return parts[0] + parts[1] if len(parts) == 2 else parts[0] if parts else Enclosure(np.float64(0.0))  # pyright: ignore
+    return parts[0] + parts[1] if len(parts) == 2 else parts[0] if parts else Enclosure(np.float64(0.0))
 
 
 def _middles(x: Complex, count: int) -> np.ndarray:
