@@ -60,6 +60,7 @@ class Enclosure:
         return Enclosure(_down(a * factor), _up(b * factor))
 
     def square(self) -> "Enclosure":
+        """Return the squares."""
         a, b = self.low * self.low, self.high * self.high
         inside = (self.low <= 0) & (self.high >= 0)
         low = np.where(inside, 0.0, np.maximum(_down(np.minimum(a, b)), 0.0))
@@ -76,6 +77,7 @@ class Enclosure:
         return np.maximum(np.abs(self.low), np.abs(self.high))
 
     def middle(self) -> Ends:
+        """Return the middles, rounded."""
         return 0.5 * (self.low + self.high)
 
     def sum(self, axis: int) -> "Enclosure":

@@ -396,8 +396,8 @@ class _Proof:
             for k in range(count + 1):
                 reserve = reserve - Enclosure(costs[:, k])
             direct = _square_modulus(over.closed) - _square_modulus(over.open) * square
-            proved = (reserve.low > 0) | (direct.low > 0)
-        failed = ~np.isfinite(costs).all(1)  # no polynomial: the parameters, in turn
+            proved = np.logical_or(reserve.low > 0, direct.low > 0)
+        failed = np.logical_not(np.isfinite(costs).all(1))  # no polynomial: the parameters, in turn
         shares = (high - low)[:, 1:] / np.maximum((self.box_widths())[None], 1e-300)
         costs = np.where(failed[:, None], np.concatenate([np.zeros((len(low), 1)), shares], 1), costs)
         return proved & np.isfinite(reserve.low), costs

@@ -448,6 +448,7 @@ class Derivation:
         return state._replace(plant=Chart(y.slip, y.speed, state.plant.distance))
 
     def initial_node(self, name: str) -> Node:
+        """Return a number of the loop's start, such as the speed."""
         path = f"initial.{name}"
         if path in self.paths:
             return self.parameter_nodes[self.paths.index(path)]
@@ -470,9 +471,11 @@ class Derivation:
         return self.indices[key]
 
     def number(self, value: float) -> int:
+        """Return the index of a constant."""
         return self.make("const", (), float(value))
 
     def pace_rate(self, rate: int, speed: int) -> int:
+        """Return a rate times the speed."""
         v = self.make("state", (), speed)
         inverse = self.make("inv", (v,))
         operation = self.operations[rate]
@@ -631,6 +634,7 @@ class Derivation:
         return self.make("mul", (x, inverse))
 
     def extreme(self, minimum: bool, x: int, y: int) -> int:
+        """Return the lesser or the greater of two operations, as a limit."""
         if self.operations[x].name == "const":
             x, y = y, x
         if self.operations[y].name == "const":
