@@ -1,5 +1,6 @@
 """Proofs of the greatest sensitivity: closed forms, dense samples, files, and claims that are wrong."""
 
+import dataclasses
 import json
 import math
 from typing import Any, NamedTuple
@@ -21,8 +22,10 @@ from diffabs.parts.references import Setpoint
 from diffabs.parts.stops import NoStop
 from diffabs.robust.frequency import FrequencyClaim, SensitivityProof, prove_sensitivity
 from diffabs.robust.frequency.certificate import frequency_document, verify_frequency
+from diffabs.robust.frequency.coefficients import Polynomials
+from diffabs.robust.frequency.intervals import Enclosure
 from diffabs.robust.frequency.opened import derive_opened
-from diffabs.robust.frequency.sensitivity import prove_claim
+from diffabs.robust.frequency.sensitivity import _respond, _slopes, _square_modulus, prove_claim
 from diffabs.robust.reach.equations import NoRule
 from diffabs.scenario.scenario import load
 
@@ -142,7 +145,38 @@ def lmi():
     "robust.frequency.sensitivity",
     "along = _inner(at.closed, _add(open_rate, rate))",
     "along = _inner(at.closed, open_rate)",
+    case="continuous",
 )
+@killed_by(
+    "robust.frequency.sensitivity", "factor = by_pole if is_pole else by_zero", "factor = by_pole", case="sampled"
+)
+@killed_by("robust.frequency.sensitivity", "sizes[k - 1].times(float(k)) * step", "sizes[k - 1] * step", case="sampled")
+@pytest.mark.parametrize("period", [pytest.param(None, id="continuous"), pytest.param(0.1, id="sampled")])
+def test_the_derivatives_of_the_form_are_those_of_differences(period):
+    """The form is f; the sides are the frequency, the gain, a coefficient and the added delay."""
+    controller = Proportional(k=0.8) if period is None else Sampled(controller=Proportional(k=0.8), period=period)
+    box = {"plant.gain": (20.0, 25.0), "plant.c1": (9.0, 11.0)}
+    equations = derive_opened(loop_of(ThirdOrder(), controller), box)
+    polynomials = Polynomials(equations, [22.5, 10.0], 1 if period else 0, broken=period is not None)
+    square, index = Enclosure(np.float64(0.2)), np.zeros(1, int)
+
+    def form(point, slopes=False):
+        rows = np.array([point[1:]])
+        coefficients = polynomials.over(rows, rows)
+        at = _respond(coefficients, Enclosure(np.array([point[0]])), period, index)
+        if slopes:
+            return [float(np.ravel(x.middle())[0]) for x in _slopes(coefficients, at, square, index, period, 3)]
+        value = _square_modulus(at.closed) - _square_modulus(at.open) * square
+        return float(np.ravel(value.middle())[0])
+
+    point = np.array([2.3, 22.0, 10.5, 0.13])
+    for side, slope in enumerate(form(point, slopes=True)):
+        step = np.zeros(4)
+        step[side] = 1e-4 * point[side]
+        difference = (form(point + step) - form(point - step)) / (2 * step[side])
+        assert slope == pytest.approx(difference, rel=1e-5, abs=1e-9)
+
+
 def test_the_peak_of_a_third_order_lag_is_that_of_the_closed_form():
     loop = loop_of(ThirdOrder())
     narrow = {"plant.gain": (25.0, 25.0)}
@@ -233,6 +267,18 @@ def test_the_cured_loop_is_bounded_within_a_thousandth():
     equations = derive_opened(loop, RIG)
     assert prove_claim(equations, RIG, FrequencyClaim(worst * 1.001)).verdict == "proved"
     assert prove_claim(equations, RIG, FrequencyClaim(worst * 0.9999)).verdict == "refuted"
+
+
+@killed_by("robust.frequency.opened", "split_off_delays(loop)[0].start().plant.distance", "loop.start().plant.distance")
+def test_five_parameters_of_the_rig_behind_a_delay():
+    loop = dataclasses.replace(load("slip-lmi").loop, actuator=Delay(time=1e-3))
+    more = {"plant.road.w4": (0.39, 0.42), "reference.slip": (0.19, 0.21), "actuator.time": (5e-4, 1e-3)}
+    box = RIG | more
+    corners = ((6.2, 13.9, w4, slip, 1e-3) for w4 in (0.39, 0.42) for slip in (0.19, 0.21))
+    worst = max(margins(open_loop(d.replace(loop, dict(zip(box, x, strict=True))))).sensitivity for x in corners)
+    equations = derive_opened(loop, box)
+    assert prove_claim(equations, box, FrequencyClaim(worst * 1.02)).verdict == "proved"
+    assert prove_claim(equations, box, FrequencyClaim(worst * 0.98)).verdict == "refuted"
 
 
 # Files.

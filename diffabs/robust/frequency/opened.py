@@ -204,7 +204,7 @@ class _OpenedDerivation(Derivation):
         )  # fmt: skip
 
     def _distance(self, loop: Loop) -> list[Array]:
-        return [jnp.asarray(loop.start().plant.distance, float)]
+        return [jnp.asarray(split_off_delays(loop)[0].start().plant.distance, float)]
 
     def jacobian(self, rows: Iterable[int], states: Iterable[int]) -> Matrix:
         """Return the derivatives of operations with respect to states."""

@@ -356,8 +356,11 @@ class _Proof:
 
     def cover_tail(self, polynomials: Polynomials, box: np.ndarray) -> tuple[float, str]:
         """Return a frequency above which the gain is small over the box, and the halvings that prove it."""
-        middle = box.mean(1)[None]
-        top = self.find_top(polynomials.over(middle, middle, slopes=False))
+        corners = itertools.islice(itertools.product(*(sorted({*ends}) for ends in box.tolist())), MANY_CORNERS)
+        top = 1.0
+        for point in ([list(corner)] for corner in corners):
+            with contextlib.suppress(_Open):  # a corner without a rest; the halvings decide
+                top = max(top, self.find_top(polynomials.over(np.array(point), np.array(point), slopes=False)))
         low, high = box[None, :, 0], box[None, :, 1]
         for _ in range(40):
             tree, low, high, nodes = _Tree(1), box[None, :, 0], box[None, :, 1], np.arange(1)
