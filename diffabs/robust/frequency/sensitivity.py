@@ -245,6 +245,9 @@ class _Proof:
         """Count the unstable poles at a point; raise _Refuted for any, and _Open if that is undecided."""
         point = np.array([[*params, added]])
         coefficients = self.polynomials(*part[1:]).over(point, point, slopes=False)
+        numbers = [x.value for x in (*coefficients.poles, *coefficients.zeros) if x is not None]
+        if not all(np.isfinite(x.low + x.high).all() for x in numbers):
+            raise _Open(f"the point of rest is not enclosed where {self.name_params(params, added)}")
         period = self.equations.period
         top = self.find_top(coefficients) if period is None else sampled_top(period)
         cells = [(0.0 if k == STRIPS else top * 2.0 ** -(k + 1), top * 2.0**-k) for k in range(STRIPS + 1)]
