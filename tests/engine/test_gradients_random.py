@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 import random_loops
-from gradients_random import WIDTHS, Found, judge, line, offenders, studied
+from gradients_random import WIDTHS, Found, Program, judge, line, offenders, studied
 from parts import inside
 
 from diffabs import actuators, controllers, plants, references, roads, sensors
@@ -36,6 +36,18 @@ def test_adaptive_gradients_are_wide_differences():
 def test_random_loops_are_allowed(name):
     for number in range(20):
         check_part(random_loops.drawn(name, number, 0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", random_loops.CHANNELS)
+def test_engines_and_modes_agree_on_loops_of_channels(name, monkeypatch):
+    found = {}
+    for engine in ("xla", "kernel"):
+        monkeypatch.setenv("DIFFABS_ENGINE", engine)
+        found[engine] = Program(name).along(0, 5)
+    np.testing.assert_allclose(found["kernel"], found["xla"], rtol=1e-9)
+    for _, forward, reverse in found.values():
+        np.testing.assert_allclose(reverse, forward, rtol=1e-9)
 
 
 ONE_PLANT = {"QuadrupleTank", "TankStart"}  # of a scenario: test_channels.py compares its derivatives

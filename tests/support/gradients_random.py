@@ -97,29 +97,43 @@ class Program:
             run = measure(loop, solver, measures, key=jax.random.key(3))
             return jnp.stack([run.metrics[one] for one in self.objectives]), run.diverged | run.timed_out
 
-        def with_slopes(*args: Any) -> tuple[Any, Any]:
-            def twice(*args: Any) -> tuple[Any, Any]:
-                values, _ = one(solver, *args)
-                return values, values
-
-            return jax.jacfwd(twice, argnums=2, has_aux=True)(*args)
+        def twice(*args: Any) -> tuple[Any, Any]:
+            values, _ = one(solver, *args)
+            return values, values
 
         self.values = jax.jit(jax.vmap(partial(one, slow), (None, None, 0)))
         self.plain = jax.jit(partial(one, FixedStep(step, duration)))
-        self.slopes = jax.jit(with_slopes)
+        self.one = partial(one, solver)
+        self.slopes = jax.jit(jax.jacfwd(twice, argnums=2, has_aux=True))
 
     @cached_property
     def finer(self) -> "Program":
         """Of shorter steps."""
         return Program(self.name, FINER * self.times, self.rtol)
 
-    def study(self, number: int, seed: int, widths: Sequence[float] = WIDTHS, slopes: bool = True) -> Found:
-        """Gradients and differences of a loop, or differences alone."""
+    def draw(self, number: int, seed: int) -> tuple[Any, Any, np.ndarray]:
+        """Return a loop, what it is measured by, and the numbers of both that are differentiated."""
         loop = canonical_dtypes(refine_parts(random_loops.drawn(self.name, number, seed), self.times))
         measures = canonical_dtypes(self.measured)
         self.places = random_loops.numbers(loop, measures)
-        x = np.array([_at(loop, measures, path)[place] for path, places in self.places.items() for place in places])
-        size = np.where(np.abs(x) > 1e-6, np.abs(x), 1e-2)
+        x = [_at(loop, measures, path)[place] for path, places in self.places.items() for place in places]
+        return loop, measures, np.array(x)
+
+    def along(self, number: int, seed: int) -> np.ndarray:
+        """Return the sum of a loop's objectives, and its slope along a random direction in both modes."""
+        *parts, x = self.draw(number, seed)
+        direction = _sizes(x) * np.random.default_rng(seed).uniform(-1.0, 1.0, len(x))
+
+        def total(x: Any) -> Any:
+            return jnp.sum(self.one(*parts, x)[0])
+
+        value, forward = jax.jit(lambda x: jax.jvp(total, (x,), (direction,)))(x)
+        return np.array([value, forward, jax.jit(jax.grad(total))(x) @ direction])
+
+    def study(self, number: int, seed: int, widths: Sequence[float] = WIDTHS, slopes: bool = True) -> Found:
+        """Gradients and differences of a loop, or differences alone."""
+        loop, measures, x = self.draw(number, seed)
+        size = _sizes(x)
         moves = [sign * width * np.diag(size) for width in widths for sign in (1, -1)]
         lanes, late = self.values(loop, measures, x + np.concatenate([np.zeros((1, len(x))), *moves]))
         lanes = _compared(lanes)
@@ -145,6 +159,11 @@ class Program:
         off[[name in BY_GRID for name in self.objectives]] = 0.0
         moved = (off > bound) | (np.abs(found.beside - found.value) > SAME * least)
         return found._replace(moved=tuple(np.array(found.objectives)[moved]))
+
+
+def _sizes(x: np.ndarray) -> np.ndarray:
+    """Sizes of numbers, in whose units they move."""
+    return np.where(np.abs(x) > 1e-6, np.abs(x), 1e-2)
 
 
 def _compared(values: Any) -> np.ndarray:
