@@ -90,6 +90,24 @@ class Road(Protocol):
         ...
 
 
+class Tyre(Protocol):
+    """The force of a tyre, or of both tyres of an axle, in straight motion.
+
+    `proportional` says whether the force is proportional to the load; then one linear equation gives loads and forces.
+    """
+
+    @property
+    def proportional(self) -> bool:
+        """Whether the friction does not depend on the load; a class attribute."""
+        ...
+
+    def braking_force(self, slip: Scalar, load: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
+        """Return the force against the motion [N] at a `slip` [1], `load` [N], vehicle `speed` [m/s] and `distance`
+        along the road [m].
+        """
+        ...
+
+
 class Plant(Protocol):
     """A plant dx/dt = derivative(t, x, u), y = output(x).
 

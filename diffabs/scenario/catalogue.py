@@ -6,7 +6,7 @@ from diffabs.core.units import control_units
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import names, read_header
 
-PLURALS = {f"{name}s": name for name in ("plant", "road", "controller", "reference", "actuator", "sensor")}
+PLURALS = {f"{name}s": name for name in ("plant", "road", "tyre", "controller", "reference", "actuator", "sensor")}
 PLURALS |= {"feedforward": "feedforward", "antiwindup": "antiwindup", "initial": "initial"}
 PLURALS |= {"stops": "stop", "objectives": "objective"}
 LISTED_FAMILIES = (*PLURALS, "scenarios")

@@ -58,6 +58,7 @@ def _methods(cls: type) -> frozenset[str]:
 FAMILIES: dict[str, tuple[tuple[ModuleType, ...], frozenset[str]]] = {
     "plant": ((plants,), _methods(protocols.Plant)),
     "road": ((roads,), _methods(protocols.Road)),
+    "tyre": ((roads,), _methods(protocols.Tyre)),
     "initial": ((plants,), frozenset()),
     "sensor": ((sensors, blocks), _methods(protocols.Block)),
     "reference": ((references,), _methods(protocols.Reference)),
@@ -158,9 +159,11 @@ def name_of(family: str, part: object) -> str:
 def family_of(field: str, enclosing: str) -> str:
     """Return the family of the parts in a field.
 
-    `road` and `roads` hold roads; any other field, such as `blocks`, holds parts of the enclosing family.
+    `road` and `roads` hold roads, and `front_tyre` a tyre. Any other field, such as `blocks`, holds parts of the
+    enclosing family.
     """
-    return next((name for name in (field, field.removesuffix("s")) if name in FAMILIES), enclosing)
+    names = (field, field.removesuffix("s"), field.rpartition("_")[2])
+    return next((name for name in names if name in FAMILIES), enclosing)
 
 
 def type_name(section: PyTree) -> str | None:

@@ -42,7 +42,7 @@ def test_list_knows_every_part():
 
 def test_list_table_shows_units_and_ranges():
     text = run("list", "plants").stdout
-    row = next(line for line in text.splitlines() if " mass " in line)
+    row = next(line for line in text.splitlines() if " mass " in line and " 5.3 " in line)
     assert [cell.strip() for cell in row.split("│")[2:-1]] == [
         "mass",
         "5.3",

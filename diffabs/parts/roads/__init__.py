@@ -1,4 +1,4 @@
-"""Friction curves: `friction(slip, speed, distance) -> mu`."""
+"""Friction curves, `friction(slip, speed, distance) -> mu`, and tyres, `braking_force(slip, load, speed, distance)`."""
 
 from diffabs.parts.roads.along import ScaledAlong as ScaledAlong
 from diffabs.parts.roads.burckhardt import DRY_ASPHALT as DRY_ASPHALT
@@ -20,3 +20,5 @@ from diffabs.parts.roads.rational import RIG_UNROUNDED as RIG_UNROUNDED
 from diffabs.parts.roads.rational import RationalCurve as RationalCurve
 from diffabs.parts.roads.tabulated import SPLINE_B as SPLINE_B
 from diffabs.parts.roads.tabulated import Tabulated as Tabulated
+from diffabs.parts.roads.tyres import PacejkaTyre as PacejkaTyre
+from diffabs.parts.roads.tyres import RoadTyre as RoadTyre
