@@ -137,7 +137,7 @@ def gauss_jordan_solve(
         T = jnp.where(pivot[:, None], T[k], T) - jnp.where(pivot, column[k], column)[:, None] * row
         return jnp.where(rows[:, None] == k, row, T), log + jnp.log(jnp.abs(value))
 
-    T, log = lax.fori_loop(0, len(M), step, (jnp.concatenate([M, W], 1), jnp.zeros_like(M[0, 0])))
+    T, log = lax.fori_loop(0, len(M), step, (jnp.concatenate([M, W], 1), jnp.zeros_like(jnp.abs(M[0, 0]))))
     return T[:, len(M) :], log
 
 

@@ -30,7 +30,13 @@ from diffabs.core.pytree import canonical_dtypes, parts
 from diffabs.core.tracing import depends_on_signal
 from diffabs.core.types import Array, Bool, Part, PyTree, Scalar
 from diffabs.core.validity import check_part
-from diffabs.linear.linearization import check_kink, coordinate_moves, independent_components, is_kinked
+from diffabs.linear.linearization import (
+    check_kink,
+    coordinate_moves,
+    independent_components,
+    is_kinked,
+    nan_at_kink,
+)
 from diffabs.linear.operating_point import MAX_REST_RESIDUE, find_root
 from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer, check_transfer
 from diffabs.linear.zero_order_hold import hold_input
@@ -139,6 +145,21 @@ def rest_point(loop: Loop, target: Scalar | None = None) -> tuple[np.ndarray, np
     return jax.device_get(_linearize_halves(undelayed, setpoint).point)
 
 
+def open_traced(loop: Loop, target: Scalar | None = None) -> OpenLoop:
+    """Return the open loop with JAX arrays, for a loop whose parameters may be tracers.
+
+    Its entries are NaN where `open_loop` raises an error for a value: at a kink, and without rest at the setpoint.
+
+    Raises:
+        ValueError: A block acts at instants and is not `Sampled`.
+    """
+    rational, delay = split_off_delays(loop)
+    _check_continuous(rational)
+    linear = _linearize_halves(rational, _start_output_and_setpoint(loop)[1] if target is None else target)
+    linear = nan_at_kink(linear, linear.kinked[0] | linear.kinked[1] | ~(linear.residue < MAX_REST_RESIDUE))
+    return _join(loop, linear, delay)
+
+
 def _open(loop: Loop, target: Scalar | None, *, plant: bool) -> OpenLoop:
     """Return the open loop. `plant`: whether the parts around the controller must be smooth, too."""
     check_part(loop)
@@ -157,10 +178,9 @@ def _open(loop: Loop, target: Scalar | None, *, plant: bool) -> OpenLoop:
     for names, kinked in halves:
         parts = ", ".join(f"{name} {type(getattr(loop, name)).__name__}" for name in names)
         check_kink(f"{parts} at the setpoint", kinked)
-    sampled = loop.controller if isinstance(loop.controller, Sampled) else None
-    delay += float(sampled.delay) if sampled else 0.0
-    controller = Transfer(*linear.controller)._replace(period=float(sampled.period) if sampled else None)
-    model = OpenLoop(Transfer(*linear.plant), controller, float(delay), control_names(loop.plant))
+    model = _join(loop, linear, delay)
+    period = None if model.period is None else float(model.period)
+    model = model._replace(controller=model.controller._replace(period=period), delay=float(model.delay))
     if not len(model.transfer().A):
         raise ValueError(
             f"controller {type(loop.controller).__name__}: its command does not follow what is measured at the "
@@ -169,11 +189,20 @@ def _open(loop: Loop, target: Scalar | None, *, plant: bool) -> OpenLoop:
     return model
 
 
+def _join(loop: Loop, linear: "_LinearHalves", delay: Scalar) -> OpenLoop:
+    """Return the halves as an open loop with the delays of actuator and computer."""
+    sampled = loop.controller if isinstance(loop.controller, Sampled) else None
+    controller = Transfer(*linear.controller)._replace(period=sampled.period if sampled else None)
+    return OpenLoop(
+        Transfer(*linear.plant), controller, delay + (sampled.delay if sampled else 0.0), control_names(loop.plant)
+    )
+
+
 def split_off_delays(loop: Loop) -> tuple[Loop, Scalar]:
     """Return the loop without its actuator's pure delays, and the sum of these delays [s]."""
     # A pure delay commutes with linear blocks, so its place in the series does not matter.
     blocks = loop.actuator.blocks if isinstance(loop.actuator, Series) else (loop.actuator,)
-    delay = sum(block.time for block in blocks if isinstance(block, Delay))
+    delay = sum((block.time for block in blocks if isinstance(block, Delay)), 0.0)
     undelayed = tuple(block for block in blocks if not isinstance(block, Delay))
     if any(map(_has_delay, undelayed)):
         name = type(loop.actuator).__name__

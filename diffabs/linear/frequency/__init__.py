@@ -1,0 +1,12 @@
+"""Frequency responses with derivatives: peaks, margins and norms of loops as JAX functions, one loop or many."""
+
+from diffabs.linear.frequency.loop_margins import Margin as Margin
+from diffabs.linear.frequency.loop_margins import complementary_peak as complementary_peak
+from diffabs.linear.frequency.loop_margins import delay_margin as delay_margin
+from diffabs.linear.frequency.loop_margins import disk_margin as disk_margin
+from diffabs.linear.frequency.loop_margins import gain_margins as gain_margins
+from diffabs.linear.frequency.loop_margins import phase_margin as phase_margin
+from diffabs.linear.frequency.loop_margins import sensitivity_peak as sensitivity_peak
+from diffabs.linear.frequency.opening import open_transfer as open_transfer
+from diffabs.linear.frequency.opening import sampled_delay_margin as sampled_delay_margin
+from diffabs.linear.frequency.search import Peak as Peak

@@ -1,0 +1,209 @@
+"""Margins of an open loop as JAX functions of its matrices, with derivatives, for one loop or for many under `vmap`.
+
+    S = (I + L)^-1,   T = I - S,   L closed by negative feedback
+
+A result is NaN if the closed loop is unstable, or if the fixed number of frequencies does not resolve the loop. A margin
+that does not exist is infinite. A loop with several channels has the peaks of the largest singular value.
+
+Derivatives are those of a smooth piece: of the peak, crossover or channel that is the worst. Where two are equally bad
+the derivative is that of one of them, and on each side another; `Peak.runner_up` and `Margin.runner_up` show how near
+the next one is. A loop whose |L| touches 1 without crossing it has no crossover there.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.core.types import Array, Bool, Scalar, Vector
+from diffabs.linear.frequency.grid import place_frequencies
+from diffabs.linear.frequency.response import as_arrays, half_sampling_rate, loop_from, respond_sensitivity
+from diffabs.linear.frequency.search import Peak, Roots, find_peaks, find_roots, highest
+from diffabs.linear.transfer import Transfer
+
+PHASE_CROSSOVERS = 16  # crossings of the real axis that are looked at
+FAR = 1e3  # times the highest frequency of the grid: infinity
+ZERO_SENSITIVITY = 1e-9  # |S| below which L is infinite but for rounding
+
+Change = Callable[[Array, Vector], Array]  # maps S (k, m, m) and frequencies (k,) to matrices (k, p, q)
+
+
+class Margin(NamedTuple):
+    """A margin of a loop.
+
+    Attributes:
+        value: Value; infinity without a limit, NaN for an unstable closed loop.
+        at: Frequency at which the limit is reached [rad/s]; NaN without one.
+        runner_up: Value at the crossover that is next; infinity without one.
+    """
+
+    value: Scalar
+    at: Scalar
+    runner_up: Scalar
+
+
+def sensitivity_peak(loop: Transfer) -> Peak:
+    """Return Ms, the greatest singular value of S over all frequencies; 1/Ms is the modulus margin.
+
+    It is differentiable in the matrices and the delay, and works under `jit` and `vmap`.
+
+    Args:
+        loop: Open loop with as many inputs as outputs, of order 1 or more. A loop with a delay in continuous time has
+            no direct path.
+
+    See also:
+        `linear.margins`: All margins of one loop, in NumPy.
+        `linear.multivariable_margins`: The same for a loop with several channels.
+
+    Examples:
+        >>> import jax
+        >>> import numpy as np
+        >>> from diffabs.linear import Transfer
+        >>> from diffabs.linear.frequency import sensitivity_peak
+        >>> A = np.array([[-10.0, -10.0, -10.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+        >>> def peak(gain):
+        ...     return sensitivity_peak(Transfer(A, np.eye(3, 1), gain * np.eye(3)[2:], np.zeros((1, 1)))).value
+        >>> value, slope = jax.value_and_grad(peak)(25.0)
+        >>> print(f"{value:.6f}, {slope:.6f} for each unit of gain")
+        2.486660, 0.078365 for each unit of gain
+    """
+    return _find_peak(loop, lambda s, _: s)
+
+
+def complementary_peak(loop: Transfer) -> Peak:
+    """Return Mt, the greatest singular value of T over all frequencies. Arguments are those of `sensitivity_peak`."""
+    return _find_peak(loop, lambda s, _: jnp.eye(s.shape[-1]) - s)
+
+
+def disk_margin(loop: Transfer) -> Margin:
+    """Return the disk margin a of a loop with one channel: 1/max |S - 1/2|.
+
+    The closed loop stays stable if L is multiplied by (1 + d/2)/(1 - d/2) for any complex |d| < a. Arguments are those
+    of `sensitivity_peak`.
+    """
+    peak = _find_peak(_single(loop), lambda s, _: s - 0.5)
+    return Margin(1 / peak.value, peak.at, 1 / jnp.maximum(peak.runner_up, 0.0))
+
+
+def gain_margins(loop: Transfer) -> tuple[Margin, Margin]:
+    """Return the factors of the gain (below 1, above 1) at which a loop with one channel turns unstable.
+
+    They are 0 and infinity without a limit. Arguments are those of `sensitivity_peak`.
+    """
+    loop = as_arrays(_single(loop))
+    grid = place_frequencies(loop)
+    values = _single_loop(grid.sensitivity)
+    # With a delay L crosses the real axis for ever. The crossings with |L| near 1 are the limits.
+    closeness = jnp.where(values.real < 0, -jnp.abs(jnp.log(jnp.abs(values))), -jnp.inf)
+    roots = find_roots(lambda w: _respond_single(loop, w).imag, grid.w, values.imag, closeness, PHASE_CROSSOVERS)
+    # At both ends of the axis L is real.
+    ends = jnp.zeros(1) if loop.period is None else jnp.stack([jnp.zeros(()), half_sampling_rate(loop)])
+    w = jnp.concatenate([roots.w, ends])
+    s = respond_sensitivity(loop, w)[:, 0, 0]
+    real = jnp.where(s == 0, -jnp.inf, (1 / jnp.where(s == 0, 1.0, s) - 1).real)
+    valid = jnp.concatenate([roots.valid, jnp.ones(len(ends), bool)]) & (real < 0) & (real > -1 / ZERO_SENSITIVITY)
+    factors = -1 / jnp.where(valid, real, -1.0)
+    below = nearest_margin(-factors, w, valid & (factors < 1), grid.decided)
+    above = nearest_margin(factors, w, valid & (factors > 1), grid.decided)
+    lower = jnp.where(jnp.isinf(below.value), 0.0, -below.value)
+    return Margin(lower, below.at, jnp.maximum(-below.runner_up, 0.0)), above
+
+
+def phase_margin(loop: Transfer) -> Margin:
+    """Return the smallest angle, lag or lead, that brings a loop with one channel to -1 [rad].
+
+    Arguments are those of `sensitivity_peak`.
+    """
+    loop = as_arrays(_single(loop))
+    roots, angles, decided = find_gain_crossovers(loop)
+    return nearest_margin(jnp.abs(angles), roots.w, roots.valid, decided)
+
+
+def delay_margin(loop: Transfer) -> Margin:
+    """Return the smallest added delay that makes a loop with one channel in continuous time unstable [s].
+
+    Arguments are those of `sensitivity_peak`; the loop has no direct path.
+
+    Raises:
+        ValueError: The loop is sampled. `sampled_delay_margin` samples it again with each delay.
+    """
+    loop = as_arrays(_single(loop))
+    if loop.period is not None:
+        raise ValueError("the loop is sampled: only whole periods of delay have a meaning for a Transfer")
+    roots, angles, decided = find_gain_crossovers(loop)
+    return nearest_margin(jnp.mod(angles, 2 * jnp.pi) / roots.w, roots.w, roots.valid, decided)
+
+
+def find_gain_crossovers(loop: Transfer) -> tuple[Roots, Vector, Bool]:
+    """Return the frequencies with |L| = 1, at most as many as states, the angle of -L there, and whether all is known.
+
+    Angles lie in (-pi, pi].
+    """
+
+    def logarithm(w: Vector) -> Array:
+        return jnp.log(jnp.abs(_respond_single(loop, w)))
+
+    grid = place_frequencies(loop)
+    values = jnp.log(jnp.abs(_single_loop(grid.sensitivity)))
+    roots = find_roots(logarithm, grid.w, values, -grid.w, loop.A.shape[0] + 1)
+    return roots, jnp.angle(-_respond_single(loop, roots.w)), grid.decided & roots.complete
+
+
+def _respond_single(loop: Transfer, w: Vector) -> Array:
+    return _single_loop(respond_sensitivity(loop, w))
+
+
+def _single_loop(sensitivity: Array) -> Array:
+    return loop_from(sensitivity)[:, 0, 0]
+
+
+def nearest_margin(values: Vector, at: Vector, valid: Array, decided: Bool) -> Margin:
+    """Return the smallest of the valid values; infinity without one, NaN if nothing is decided."""
+    values = jnp.where(valid, values, jnp.inf)
+    first, second = jnp.argsort(values)[:2]
+    least = jnp.where(decided, values[first], jnp.nan)
+    return Margin(least, jnp.where(jnp.isfinite(least), at[first], jnp.nan), values[second])
+
+
+def find_sensitivity_peaks(loop: Transfer, change: Change) -> tuple[Vector, Vector, Bool]:
+    """Return the local maxima of the largest singular value of a function of S, their frequencies, and whether S is known.
+
+    The maxima have no order; missing ones are -inf. Both ends of the frequency axis count, and the limit of a loop in
+    continuous time, where the function gets a frequency far above the poles.
+    """
+    grid = place_frequencies(loop)
+
+    def measure(sensitivity: Array, w: Vector) -> Vector:
+        return largest_singular_values(change(sensitivity, w))
+
+    tops, at = find_peaks(lambda w: measure(respond_sensitivity(loop, w), w), grid.w, measure(grid.sensitivity, grid.w))
+    ends = jnp.zeros(1) if loop.period is None else jnp.stack([jnp.zeros(()), half_sampling_rate(loop)])
+    tops, at = jnp.append(tops, measure(respond_sensitivity(loop, ends), ends)), jnp.append(at, ends)
+    if loop.period is None:
+        far = jnp.linalg.inv(jnp.eye(loop.D.shape[0]) + loop.D)
+        tops, at = jnp.append(tops, measure(far[None], FAR * grid.w[-1:])), jnp.append(at, jnp.inf)
+    return tops, at, grid.decided
+
+
+def _find_peak(loop: Transfer, change: Change) -> Peak:
+    tops, at, decided = find_sensitivity_peaks(as_arrays(loop), change)
+    peak = highest(tops, at)
+    return peak._replace(value=jnp.where(decided, peak.value, jnp.nan))
+
+
+def largest_singular_values(matrices: Array) -> Vector:
+    """Return the largest singular value of each matrix (k, p, m)."""
+    if 1 in matrices.shape[1:]:
+        # The square root of a sum of squares has no derivative at 0, where a response may be.
+        squares = jnp.sum(matrices.real**2 + matrices.imag**2, axis=(1, 2))
+        zero = squares == 0
+        return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squares)))
+    return jnp.linalg.svd(matrices, compute_uv=False)[:, 0]
+
+
+def _single(loop: Transfer) -> Transfer:
+    """Return a loop with one channel. Raises ValueError for another one."""
+    if np.shape(loop.D) != (1, 1):
+        raise ValueError(f"L has the shape {np.shape(loop.D)}: this margin is of one channel")
+    return loop
