@@ -114,14 +114,14 @@ def times(*factors: jax.Array) -> jax.Array:
     return reduce(lambda X, Y: reduce(add, (X[:, k, None] * Y[None, k] for k in range(len(Y)))), factors)
 
 
-def eye(n: int, like: Float[Array, "... batch"]) -> Float[Array, "{n} {n} batch"]:
+def eye(n: int, like: Num[Array, "... batch"]) -> Num[Array, "{n} {n} batch"]:
     """Return an identity matrix (n, n, batch) for each matrix of `like`, of its data type."""
     return jnp.broadcast_to(jnp.eye(n, dtype=like.dtype)[..., None], (n, n, like.shape[-1]))
 
 
 def gauss_jordan_solve(
-    M: Float[Array, "n n batch"], W: Float[Array, "n m batch"]
-) -> tuple[Float[Array, "n m batch"], Float[Array, " batch"]]:
+    M: Num[Array, "n n batch"], W: Num[Array, "n m batch"]
+) -> tuple[Num[Array, "n m batch"], Float[Array, " batch"]]:
     """Return M^-1 W and log abs det M for each M (n, n, batch), by elimination with partial pivoting."""
     rows = jnp.arange(len(M))[:, None]
 

@@ -160,6 +160,13 @@ def open_traced(loop: Loop, target: Scalar | None = None) -> OpenLoop:
     return _join(loop, linear, delay)
 
 
+def tracked_columns(loop: Loop) -> list[int]:
+    """Return the columns of the controller's inputs that are measurements of the tracked signals."""
+    output, setpoint = jax.eval_shape(_start_output_and_setpoint, loop)
+    tracked = setpoint._fields if has_channels(setpoint) else loop.plant.shows._fields[:1]
+    return [len(jax.tree.leaves(setpoint)) + output._fields.index(name) for name in tracked]
+
+
 def _open(loop: Loop, target: Scalar | None, *, plant: bool) -> OpenLoop:
     """Return the open loop. `plant`: whether the parts around the controller must be smooth, too."""
     check_part(loop)
@@ -193,9 +200,8 @@ def _join(loop: Loop, linear: "_LinearHalves", delay: Scalar) -> OpenLoop:
     """Return the halves as an open loop with the delays of actuator and computer."""
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     controller = Transfer(*linear.controller)._replace(period=sampled.period if sampled else None)
-    return OpenLoop(
-        Transfer(*linear.plant), controller, delay + (sampled.delay if sampled else 0.0), control_names(loop.plant)
-    )
+    delay = delay + (sampled.delay if sampled else 0.0)
+    return OpenLoop(Transfer(*linear.plant), controller, delay, control_names(loop.plant))  # pyright: ignore[reportArgumentType]
 
 
 def split_off_delays(loop: Loop) -> tuple[Loop, Scalar]:

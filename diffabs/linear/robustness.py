@@ -106,15 +106,20 @@ def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, tar
             raise ValueError(f"{path}: the range ({low:g}, {high:g}) is inverted")
     if 2 ** len(free) > MAX_BAND_CORNERS:
         raise ValueError(f"{len(free)} ranges have {2 ** len(free)} corners; at most {MAX_BAND_CORNERS} are looked at")
-    corners = list(dict.fromkeys(itertools.product(*free.values())))
-    inside = low_discrepancy_points(samples if any(low < high for low, high in free.values()) else 0, len(free))
-    low, high = np.array(list(free.values())).reshape(-1, 2).T
     systems = []
-    for at in [*corners, *(low + (high - low) * inside).tolist()]:
+    for at in box_points(list(free.values()), samples):
         values = dict(zip(free, map(float, at), strict=True))
         opened = open_loop(replace(loop, values), target)
         systems.append(System(values, opened, margins(opened)))
-    return Band(tuple(systems), len(corners))
+    return Band(tuple(systems), len(set(itertools.product(*free.values()))))
+
+
+def box_points(ranges: Sequence[tuple[float, float]], samples: int) -> list[tuple[float, ...]]:
+    """Return the distinct corners of a box of ranges (low, high), then samples inside that fill it evenly."""
+    corners = list(dict.fromkeys(itertools.product(*ranges)))
+    low, high = np.array(ranges).reshape(-1, 2).T
+    inside = low_discrepancy_points(samples if (low < high).any() else 0, len(ranges))
+    return [*corners, *map(tuple, (low + (high - low) * inside).tolist())]
 
 
 def low_discrepancy_points(count: int, dimensions: int) -> Float[np.ndarray, "{count} {dimensions}"]:

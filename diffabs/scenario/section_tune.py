@@ -19,11 +19,18 @@
     level = 0.9
     [tune.limits]
     overshoot = 0.008                                        # at most, on every lane
+    [tune.constraints]                                       # of the linear loop, over [design.over]
+    sensitivity = 1.7                                        # greatest |S| at most; also complementary, control_noise
+    delay_margin = 5e-3                                      # s at least; also phase_margin, in rad
+    shape = [[10.0, 0.5], [100.0, 1.7]]                      # |S| at most: rows of frequency [rad/s] and value
+    samples = 8                                              # points inside the ranges, besides the corners
 
 Paths are those of `parameter_paths`. Reading the section needs no extra; tuning needs the extra `tune`.
 """
 
 import dataclasses
+import functools
+import itertools
 import math
 from collections.abc import Iterable, Mapping
 
@@ -33,7 +40,9 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import ParameterSpec, parameters
 from diffabs.core.types import JsonObject, Table
 from diffabs.host.values import (
+    Reader,
     ScenarioError,
+    list_reader,
     plain_fields,
     range_reader,
     read_as_given,
@@ -71,6 +80,50 @@ def _aggregate(value: object, path: str) -> JsonObject:
     }
 
 
+def _positive_reader(unit: str) -> Reader:
+    return range_reader(ParameterSpec(unit, low=0.0, open_low=True))
+
+
+def _read_shape(value: object, path: str) -> tuple[tuple[float, float], ...]:
+    """Return rows of frequency and bound; the frequencies increase."""
+    read = list_reader(list_reader(_positive_reader("1")))
+    rows = read(value, path)
+    if any(len(row) != 2 for row in rows):
+        raise ScenarioError(f"{path}: each row is [frequency in rad/s, greatest |S|]")
+    if any(after[0] <= before[0] for before, after in itertools.pairwise(rows)):
+        raise ScenarioError(f"{path}: the frequencies of the rows increase")
+    return rows
+
+
+@dataclasses.dataclass(frozen=True)
+class FrequencyConstraints:
+    """Bounds of the linear loop at the corners of [design.over] and at points inside; None for no bound.
+
+    Attributes:
+        sensitivity: Greatest |S|, at least 1.
+        complementary: Greatest |T|.
+        delay_margin: Least delay margin [s].
+        phase_margin: Least phase margin [rad].
+        control_noise: Greatest gain from noise on the tracked signals to the command.
+        shape: Rows (frequency [rad/s], greatest |S|).
+        samples: Number of points inside the ranges.
+    """
+
+    sensitivity: float | None = table_field(range_reader(ParameterSpec("1", low=1.0, open_low=True)), None)
+    complementary: float | None = table_field(_positive_reader("1"), None)
+    delay_margin: float | None = table_field(_positive_reader("s"), None)
+    phase_margin: float | None = table_field(_positive_reader("rad"), None)
+    control_noise: float | None = table_field(_positive_reader("1"), None)
+    shape: tuple[tuple[float, float], ...] = table_field(_read_shape, ())
+    samples: int = table_field(whole_reader(0, 1000), 8)
+
+    def bounds(self) -> JsonObject:
+        """Return the bounds by name, without those that are not set."""
+        return {
+            name: value for name, value in plain_fields(self).items() if name != "samples" and value not in (None, [])
+        }
+
+
 @dataclasses.dataclass(frozen=True)
 class Goal:
     """The goal of a tuning, in SI.
@@ -87,6 +140,7 @@ class Goal:
         over: Values by path.
         aggregate: Type and fields of the aggregate over the runs.
         limits: Greatest allowed values by metric.
+        constraints: Bounds of the linear loop's margins.
     """
 
     starts: int = table_field(whole_reader(1, 1000), 1)
@@ -100,11 +154,14 @@ class Goal:
     over: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     aggregate: Table = table_field(_aggregate, lambda: {"type": "mean"})
     limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    constraints: FrequencyConstraints = dataclasses.field(default_factory=FrequencyConstraints)
 
     def table(self) -> JsonObject:
         """Return the section as TOML values."""
         free = {path: DECLARED_RANGE if ends is None else interval_table(*ends) for path, ends in self.free.items()}
-        return plain_fields(self) | {"free": free}
+        bounds = self.constraints.bounds()
+        constraints = bounds | {"samples": self.constraints.samples} if bounds else {}
+        return plain_fields(self) | {"free": free, "constraints": constraints}
 
     def check(self, loop: Loop) -> "Goal":
         """Return this goal unchanged if `loop` can be tuned with it."""
@@ -154,6 +211,7 @@ def read_tune_section(table: object, loop: Loop, objectives: Mapping[str, Object
         free=lambda value, path: free_ranges(table_reader(read_as_given, "ranges")(value, path), loop, path),
         over=lambda value, path: _over(table_reader(read_as_given, "values")(value, path), loop, bool(samples)),
         objective=metric_reader(objectives, "weights of metrics"),
+        constraints=functools.partial(read_table, FrequencyConstraints),
         limits=metric_reader(
             objectives, "greatest values of metrics", lambda objective: unit_of(objective, loop.plant)
         ),

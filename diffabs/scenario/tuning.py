@@ -10,7 +10,9 @@ from diffabs.core.bijectors import reached_bound
 from diffabs.core.pytree import get, parameters
 from diffabs.core.types import JsonObject, Params, Scalar
 from diffabs.host.values import ScenarioError
+from diffabs.linear.robustness import box_points
 from diffabs.loop.admissible import first_refusal
+from diffabs.loop.batch import Batch
 from diffabs.loop.closed_loop import Loop
 from diffabs.scenario import proving
 from diffabs.scenario.proving import Proved
@@ -18,10 +20,11 @@ from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
     from diffabs.robust.design.loop_task import ProofTask
-    from diffabs.tune import Batch, Method, Tuned
+    from diffabs.tune import FrequencyBounds, Method, Tuned
     from diffabs.tune.problem import Problem
 
 WHEN = ("before", "after")
+MARGINS = "margins"  # name of the constraints of [tune.constraints]
 
 
 class Work(NamedTuple):
@@ -35,7 +38,7 @@ class Work(NamedTuple):
     """
 
     scenario: Scenario
-    batch: "Batch"
+    batch: Batch
     constraints: JsonObject
     task: "ProofTask | None"
 
@@ -54,7 +57,36 @@ def build_work(scenario: Scenario) -> Work:
         constraints["certified decay"] = CertifiedDecay(task.polytope, goal.decay)
     if task and goal.damping:
         constraints["damping"] = Poles(task.polytope, damping=goal.damping)
+    if goal.constraints.bounds():
+        constraints[MARGINS] = build_frequency_bounds(scenario)
     return Work(scenario, batch, constraints, task)
+
+
+def build_frequency_bounds(scenario: Scenario) -> "FrequencyBounds":
+    """Return the bounds of [tune.constraints] at the corners of [design.over] and at points inside.
+
+    Raises:
+        ScenarioError: A bound is of one control and the plant has several, or the loop has no margins at a point.
+    """
+    from diffabs.tune import FrequencyBounds
+
+    section, loop = scenario.tune.constraints, scenario.loop
+    ranges = scenario.design.ranges(loop)
+    points = np.array(box_points(list(ranges.values()), section.samples))
+    bounds = FrequencyBounds(
+        **{name: getattr(section, name) for name in section.bounds()},
+        points=Batch({path: points[:, i] for i, path in enumerate(ranges)}),
+    )
+    try:
+        worst = bounds.worst(loop)
+    except ValueError as error:
+        raise ScenarioError(f"tune.constraints: {error}") from None
+    if missing := [name for name, value in worst.items() if math.isnan(value)]:
+        raise ScenarioError(
+            f"tune.constraints: no {', '.join(missing)} at the start: the loop is unstable, or has no linear model, at "
+            "a point of [design.over]; `diffabs margins` says where"
+        )
+    return bounds
 
 
 def build_tuning(work: Work, engine: str = "auto") -> "Problem":
@@ -116,7 +148,7 @@ def with_unproved(work: Work, result: JsonObject) -> JsonObject:
     unseen = [
         {"name": name, "bound": bounds[name], "before": None, "after": None, "met": False, "missed": None}
         for name in work.constraints
-        if name not in names
+        if name not in names and name != MARGINS
     ]
     return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
 
@@ -143,6 +175,12 @@ def _constraints(work: Work, tuned: "Tuned", proved: Proved) -> list[JsonObject]
     for name, bound in goal.limits.items():
         before, after = (float(np.max(metrics[name])) for metrics in tuned.metrics)
         rows.append(_constraint_row(name, bound, before, after, at_most=True))
+    if bounds := work.constraints.get(MARGINS):
+        from diffabs.tune.frequency_bounds import AT_MOST
+
+        before, after = bounds.worst(work.scenario.loop), bounds.worst(tuned.loop)
+        for name, bound in bounds.bounds.items():
+            rows.append(_constraint_row(name, bound, before[name], after[name], at_most=name in AT_MOST))
     if work.task and goal.decay:
         before, after = work.task.certify().decay_rate, proved.document["decay_rate"]
         rows.append(_constraint_row("certified decay", goal.decay, before, after, at_most=False))

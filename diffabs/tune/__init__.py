@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from diffabs.tune.constraints import AtMost as AtMost
     from diffabs.tune.constraints import CertifiedDecay as CertifiedDecay
     from diffabs.tune.constraints import Poles as Poles
+    from diffabs.tune.frequency_bounds import FrequencyBounds as FrequencyBounds
     from diffabs.tune.method import DerivativeMode as DerivativeMode
     from diffabs.tune.method import Method as Method
     from diffabs.tune.method import Stopping as Stopping

@@ -7,6 +7,10 @@ from diffabs.linear.frequency.loop_margins import disk_margin as disk_margin
 from diffabs.linear.frequency.loop_margins import gain_margins as gain_margins
 from diffabs.linear.frequency.loop_margins import phase_margin as phase_margin
 from diffabs.linear.frequency.loop_margins import sensitivity_peak as sensitivity_peak
+from diffabs.linear.frequency.norms import h2_norm as h2_norm
+from diffabs.linear.frequency.norms import hinf_norm as hinf_norm
 from diffabs.linear.frequency.opening import open_transfer as open_transfer
 from diffabs.linear.frequency.opening import sampled_delay_margin as sampled_delay_margin
 from diffabs.linear.frequency.search import Peak as Peak
+from diffabs.linear.frequency.structured import Mu as Mu
+from diffabs.linear.frequency.structured import structured_singular_value as structured_singular_value

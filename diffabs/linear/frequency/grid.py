@@ -1,6 +1,6 @@
 """Frequencies between which a loop changes little, a fixed number of them, and the stability of the closed loop.
 
-The number of frequencies depends on the order alone, so a search over them works under `vmap`. They are placed in two
+The number of frequencies depends on the order alone, so a search over them works under `vmap`. They are placed in
 passes: first even on the logarithmic axis and close around every pole, then even in how far L and 1 + L move.
 
 **Stability** with an exact delay is Mikhailov's criterion. Let f(jw) = det(jw - A + B e^(-jw delay) C), of order n. The
@@ -8,22 +8,24 @@ closed loop is stable if and only if the argument of f grows by n pi/2 from w = 
 n pi up to half the sampling rate (A. V. Mikhailov, 1938; with delays: L. S. Pontryagin, 1942).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.types import Array, Bool, Scalar, Vector
+from diffabs.core.types import Array, Bool, Scalar
 from diffabs.linear.frequency.response import (
+    TracedSystem,
     closed_poles_without_delay,
     half_sampling_rate,
     loop_from,
-    respond_sensitivity,
+    search_sensitivity,
 )
-from diffabs.linear.transfer import Transfer
 
 GRID_DECADES = 3.0  # of the grid beyond the slowest and the fastest pole
-LOG_POINTS, EVEN_POINTS = 160, 192  # of the first pass and of the second
+LOG_POINTS = 160  # of the first pass
+SPREADS, EVEN_POINTS = 2, 96  # passes that follow, and points of each
 AROUND_POLE = (-5.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 5.0)  # places around a pole, times its decay rate
 PAIR_OFFSET = 0.07  # of these places for the second of a conjugate pair
 MAX_MOVE = 2.0  # largest relative move of L between two points that attracts points
@@ -39,14 +41,16 @@ class FrequencyGrid(NamedTuple):
 
     Attributes:
         w: Frequencies (k,), increasing from well below to well above the poles [rad/s].
-        sensitivity: S there, (k, m, m).
+        sensitivity: S there, (k, m, m), but for errors that a search may have.
+        respond: S as a function of other frequencies, with the same errors.
         stable: Whether the closed loop is stable.
         resolved: Whether the grid resolves the argument of the characteristic function. If it does not, `stable` says
             nothing.
     """
 
-    w: Vector
+    w: Array
     sensitivity: Array
+    respond: Callable[[Array], Array]
     stable: Bool
     resolved: Bool
 
@@ -56,18 +60,20 @@ class FrequencyGrid(NamedTuple):
         return jnp.asarray(self.stable) & self.resolved
 
 
-def place_frequencies(system: Transfer) -> FrequencyGrid:
+def place_frequencies(system: TracedSystem) -> FrequencyGrid:
     """Return the frequencies of an open loop and the stability of its closed loop. They have no derivative."""
     system = jax.lax.stop_gradient(system)
-    poles = jnp.linalg.eigvals(system.A)
-    w = first_frequencies(system, jnp.append(poles, closed_poles_without_delay(system)))
-    sensitivity = respond_sensitivity(system, w)
-    w = spread_evenly(w, _relative_moves(sensitivity, 0.0), _relative_moves(loop_from(sensitivity), SMALL_LOOP))
-    sensitivity = respond_sensitivity(system, w)
-    return FrequencyGrid(w, sensitivity, *_is_stable(system.period, poles, w, sensitivity))
+    poles, closed = jnp.linalg.eigvals(system.A), closed_poles_without_delay(system)
+    respond = search_sensitivity(system, poles, closed)
+    w = first_frequencies(system, jnp.append(poles, closed))
+    sensitivity = respond(w)
+    for _ in range(SPREADS):
+        w = spread_evenly(w, relative_moves(sensitivity, 0.0), relative_moves(loop_from(sensitivity), SMALL_LOOP))
+        sensitivity = respond(w)
+    return FrequencyGrid(w, sensitivity, respond, *_is_stable(system.period, poles, w, sensitivity))
 
 
-def first_frequencies(system: Transfer, poles: Array) -> Vector:
+def first_frequencies(system: TracedSystem, poles: Array) -> Array:
     """Return frequencies that are even on the logarithmic axis, and close around each of some poles (k,)."""
     half = half_sampling_rate(system)
     if system.period is not None:
@@ -79,7 +85,7 @@ def first_frequencies(system: Transfer, poles: Array) -> Vector:
     low = jnp.min(jnp.where(counts, sizes, jnp.inf), initial=jnp.inf)
     low, high = (jnp.where(largest > 0, x, 1.0) for x in (low, largest))
     # A delay turns L at frequencies of its own.
-    high = jnp.maximum(high, jnp.where(jnp.asarray(system.delay) > 0, 10.0 / jnp.maximum(system.delay, 1e-30), 0.0))
+    high = jnp.maximum(high, jnp.where(system.delay > 0, 10.0 / jnp.maximum(system.delay, 1e-30), 0.0))
     high = jnp.minimum(high * 10.0**GRID_DECADES, half)
     low = jnp.minimum(low, high) * 10.0**-GRID_DECADES
     even = jnp.geomspace(low, high, LOG_POINTS)
@@ -90,7 +96,7 @@ def first_frequencies(system: Transfer, poles: Array) -> Vector:
     return jnp.sort(jnp.concatenate([even, jnp.where((around > low) & (around < high), around, elsewhere)]))
 
 
-def spread_evenly(w: Vector, *moves: Vector) -> Vector:
+def spread_evenly(w: Array, *moves: Array) -> Array:
     """Return the frequencies with others between them where something moves most; `moves` has an entry less than w."""
     even = LOG_SHARE * len(w) * jnp.diff(jnp.log(w)) / jnp.log(w[-1] / w[0])
     length = jnp.concatenate([jnp.zeros(1), jnp.cumsum(sum(moves, even))])
@@ -98,7 +104,7 @@ def spread_evenly(w: Vector, *moves: Vector) -> Vector:
     return jnp.sort(jnp.concatenate([w, jnp.exp(jnp.interp(places, length, jnp.log(w)))]))
 
 
-def _relative_moves(values: Array, least: float) -> Array:
+def relative_moves(values: Array, least: float) -> Array:
     """Return how far matrices (k, m, m) move between neighbours, relative to the smaller one, at most `MAX_MOVE`."""
     sizes = jnp.sqrt(jnp.sum(jnp.abs(values) ** 2, axis=(1, 2)))
     change = jnp.sqrt(jnp.sum(jnp.abs(jnp.diff(values, axis=0)) ** 2, axis=(1, 2)))
@@ -106,7 +112,7 @@ def _relative_moves(values: Array, least: float) -> Array:
     return jnp.nan_to_num(jnp.minimum(change / base, MAX_MOVE), nan=MAX_MOVE)
 
 
-def _is_stable(period: Scalar | None, poles: Array, w: Vector, sensitivity: Array) -> tuple[Bool, Bool]:
+def _is_stable(period: Scalar | None, poles: Array, w: Array, sensitivity: Array) -> tuple[Bool, Bool]:
     """Return whether the closed loop is stable by Mikhailov's criterion, and whether the frequencies resolve that.
 
     `poles` (n,) are those of the open loop: f is the product of jw - pole, over det S.

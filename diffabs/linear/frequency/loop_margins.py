@@ -2,8 +2,8 @@
 
     S = (I + L)^-1,   T = I - S,   L closed by negative feedback
 
-A result is NaN if the closed loop is unstable, or if the fixed number of frequencies does not resolve the loop. A margin
-that does not exist is infinite. A loop with several channels has the peaks of the largest singular value.
+A result is NaN if the closed loop is unstable, or if the fixed number of frequencies does not resolve the loop. A
+margin that does not exist is infinite. A loop with several channels has the peaks of the largest singular value.
 
 Derivatives are those of a smooth piece: of the peak, crossover or channel that is the worst. Where two are equally bad
 the derivative is that of one of them, and on each side another; `Peak.runner_up` and `Margin.runner_up` show how near
@@ -16,9 +16,17 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.types import Array, Bool, Scalar, Vector
-from diffabs.linear.frequency.grid import place_frequencies
-from diffabs.linear.frequency.response import as_arrays, half_sampling_rate, loop_from, respond_sensitivity
+from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
+from diffabs.core.types import Array, Bool, Scalar
+from diffabs.linear.frequency.grid import FrequencyGrid, place_frequencies
+from diffabs.linear.frequency.response import (
+    TracedSystem,
+    as_arrays,
+    half_sampling_rate,
+    largest_singular_values,
+    loop_from,
+    respond_sensitivity,
+)
 from diffabs.linear.frequency.search import Peak, Roots, find_peaks, find_roots, highest
 from diffabs.linear.transfer import Transfer
 
@@ -26,7 +34,7 @@ PHASE_CROSSOVERS = 16  # crossings of the real axis that are looked at
 FAR = 1e3  # times the highest frequency of the grid: infinity
 ZERO_SENSITIVITY = 1e-9  # |S| below which L is infinite but for rounding
 
-Change = Callable[[Array, Vector], Array]  # maps S (k, m, m) and frequencies (k,) to matrices (k, p, q)
+Change = Callable[[Array, Array], Array]  # maps S (k, m, m) and frequencies (k,) to matrices (k, p, q)
 
 
 class Margin(NamedTuple):
@@ -43,7 +51,8 @@ class Margin(NamedTuple):
     runner_up: Scalar
 
 
-def sensitivity_peak(loop: Transfer) -> Peak:
+@compile_once(options=SAME_RESULT_OPTIONS)
+def sensitivity_peak(loop: Transfer | TracedSystem) -> Peak:
     """Return Ms, the greatest singular value of S over all frequencies; 1/Ms is the modulus margin.
 
     It is differentiable in the matrices and the delay, and works under `jit` and `vmap`.
@@ -71,12 +80,14 @@ def sensitivity_peak(loop: Transfer) -> Peak:
     return _find_peak(loop, lambda s, _: s)
 
 
-def complementary_peak(loop: Transfer) -> Peak:
+@compile_once(options=SAME_RESULT_OPTIONS)
+def complementary_peak(loop: Transfer | TracedSystem) -> Peak:
     """Return Mt, the greatest singular value of T over all frequencies. Arguments are those of `sensitivity_peak`."""
     return _find_peak(loop, lambda s, _: jnp.eye(s.shape[-1]) - s)
 
 
-def disk_margin(loop: Transfer) -> Margin:
+@compile_once(options=SAME_RESULT_OPTIONS)
+def disk_margin(loop: Transfer | TracedSystem) -> Margin:
     """Return the disk margin a of a loop with one channel: 1/max |S - 1/2|.
 
     The closed loop stays stable if L is multiplied by (1 + d/2)/(1 - d/2) for any complex |d| < a. Arguments are those
@@ -86,17 +97,25 @@ def disk_margin(loop: Transfer) -> Margin:
     return Margin(1 / peak.value, peak.at, 1 / jnp.maximum(peak.runner_up, 0.0))
 
 
-def gain_margins(loop: Transfer) -> tuple[Margin, Margin]:
+@compile_once(options=SAME_RESULT_OPTIONS)
+def gain_margins(loop: Transfer | TracedSystem) -> tuple[Margin, Margin]:
     """Return the factors of the gain (below 1, above 1) at which a loop with one channel turns unstable.
 
     They are 0 and infinity without a limit. Arguments are those of `sensitivity_peak`.
     """
-    loop = as_arrays(_single(loop))
+    loop = _single(loop)
     grid = place_frequencies(loop)
     values = _single_loop(grid.sensitivity)
     # With a delay L crosses the real axis for ever. The crossings with |L| near 1 are the limits.
     closeness = jnp.where(values.real < 0, -jnp.abs(jnp.log(jnp.abs(values))), -jnp.inf)
-    roots = find_roots(lambda w: _respond_single(loop, w).imag, grid.w, values.imag, closeness, PHASE_CROSSOVERS)
+    roots = find_roots(
+        lambda w: _respond_single(loop, w).imag,
+        lambda w: _single_loop(grid.respond(w)).imag,
+        grid.w,
+        values.imag,
+        closeness,
+        PHASE_CROSSOVERS,
+    )
     # At both ends of the axis L is real.
     ends = jnp.zeros(1) if loop.period is None else jnp.stack([jnp.zeros(()), half_sampling_rate(loop)])
     w = jnp.concatenate([roots.w, ends])
@@ -110,17 +129,24 @@ def gain_margins(loop: Transfer) -> tuple[Margin, Margin]:
     return Margin(lower, below.at, jnp.maximum(-below.runner_up, 0.0)), above
 
 
-def phase_margin(loop: Transfer) -> Margin:
+@compile_once(options=SAME_RESULT_OPTIONS)
+def phase_margin(loop: Transfer | TracedSystem) -> Margin:
     """Return the smallest angle, lag or lead, that brings a loop with one channel to -1 [rad].
 
     Arguments are those of `sensitivity_peak`.
     """
-    loop = as_arrays(_single(loop))
-    roots, angles, decided = find_gain_crossovers(loop)
+    loop = _single(loop)
+    return phase_margin_on(loop, place_frequencies(loop))
+
+
+def phase_margin_on(loop: TracedSystem, grid: FrequencyGrid) -> Margin:
+    """Return the phase margin of a loop of arrays whose frequencies are known."""
+    roots, angles, decided = find_gain_crossovers(loop, grid)
     return nearest_margin(jnp.abs(angles), roots.w, roots.valid, decided)
 
 
-def delay_margin(loop: Transfer) -> Margin:
+@compile_once(options=SAME_RESULT_OPTIONS)
+def delay_margin(loop: Transfer | TracedSystem) -> Margin:
     """Return the smallest added delay that makes a loop with one channel in continuous time unstable [s].
 
     Arguments are those of `sensitivity_peak`; the loop has no direct path.
@@ -128,29 +154,39 @@ def delay_margin(loop: Transfer) -> Margin:
     Raises:
         ValueError: The loop is sampled. `sampled_delay_margin` samples it again with each delay.
     """
-    loop = as_arrays(_single(loop))
+    loop = _single(loop)
     if loop.period is not None:
         raise ValueError("the loop is sampled: only whole periods of delay have a meaning for a Transfer")
-    roots, angles, decided = find_gain_crossovers(loop)
+    return delay_margin_on(loop, place_frequencies(loop))
+
+
+def delay_margin_on(loop: TracedSystem, grid: FrequencyGrid) -> Margin:
+    """Return the delay margin of a loop of arrays in continuous time whose frequencies are known."""
+    roots, angles, decided = find_gain_crossovers(loop, grid)
     return nearest_margin(jnp.mod(angles, 2 * jnp.pi) / roots.w, roots.w, roots.valid, decided)
 
 
-def find_gain_crossovers(loop: Transfer) -> tuple[Roots, Vector, Bool]:
+def find_gain_crossovers(loop: TracedSystem, grid: FrequencyGrid) -> tuple[Roots, Array, Bool]:
     """Return the frequencies with |L| = 1, at most as many as states, the angle of -L there, and whether all is known.
 
     Angles lie in (-pi, pi].
     """
 
-    def logarithm(w: Vector) -> Array:
-        return jnp.log(jnp.abs(_respond_single(loop, w)))
+    def logarithm(sensitivity: Array) -> Array:
+        return jnp.log(jnp.abs(_single_loop(sensitivity)))
 
-    grid = place_frequencies(loop)
-    values = jnp.log(jnp.abs(_single_loop(grid.sensitivity)))
-    roots = find_roots(logarithm, grid.w, values, -grid.w, loop.A.shape[0] + 1)
+    roots = find_roots(
+        lambda w: logarithm(respond_sensitivity(loop, w)),
+        lambda w: logarithm(grid.respond(w)),
+        grid.w,
+        logarithm(grid.sensitivity),
+        -grid.w,
+        loop.A.shape[0] + 1,
+    )
     return roots, jnp.angle(-_respond_single(loop, roots.w)), grid.decided & roots.complete
 
 
-def _respond_single(loop: Transfer, w: Vector) -> Array:
+def _respond_single(loop: TracedSystem, w: Array) -> Array:
     return _single_loop(respond_sensitivity(loop, w))
 
 
@@ -158,7 +194,7 @@ def _single_loop(sensitivity: Array) -> Array:
     return loop_from(sensitivity)[:, 0, 0]
 
 
-def nearest_margin(values: Vector, at: Vector, valid: Array, decided: Bool) -> Margin:
+def nearest_margin(values: Array, at: Array, valid: Array, decided: Bool) -> Margin:
     """Return the smallest of the valid values; infinity without one, NaN if nothing is decided."""
     values = jnp.where(valid, values, jnp.inf)
     first, second = jnp.argsort(values)[:2]
@@ -166,44 +202,39 @@ def nearest_margin(values: Vector, at: Vector, valid: Array, decided: Bool) -> M
     return Margin(least, jnp.where(jnp.isfinite(least), at[first], jnp.nan), values[second])
 
 
-def find_sensitivity_peaks(loop: Transfer, change: Change) -> tuple[Vector, Vector, Bool]:
-    """Return the local maxima of the largest singular value of a function of S, their frequencies, and whether S is known.
+def find_sensitivity_peaks(loop: TracedSystem, grid: FrequencyGrid, change: Change) -> tuple[Array, Array]:
+    """Return the local maxima of the largest singular value of a function of S, and their frequencies.
 
     The maxima have no order; missing ones are -inf. Both ends of the frequency axis count, and the limit of a loop in
     continuous time, where the function gets a frequency far above the poles.
     """
-    grid = place_frequencies(loop)
 
-    def measure(sensitivity: Array, w: Vector) -> Vector:
+    def measure(sensitivity: Array, w: Array) -> Array:
         return largest_singular_values(change(sensitivity, w))
 
-    tops, at = find_peaks(lambda w: measure(respond_sensitivity(loop, w), w), grid.w, measure(grid.sensitivity, grid.w))
+    tops, at = find_peaks(
+        lambda w: measure(respond_sensitivity(loop, w), w),
+        lambda w: measure(grid.respond(w), w),
+        grid.w,
+        measure(grid.sensitivity, grid.w),
+    )
     ends = jnp.zeros(1) if loop.period is None else jnp.stack([jnp.zeros(()), half_sampling_rate(loop)])
     tops, at = jnp.append(tops, measure(respond_sensitivity(loop, ends), ends)), jnp.append(at, ends)
     if loop.period is None:
         far = jnp.linalg.inv(jnp.eye(loop.D.shape[0]) + loop.D)
         tops, at = jnp.append(tops, measure(far[None], FAR * grid.w[-1:])), jnp.append(at, jnp.inf)
-    return tops, at, grid.decided
+    return tops, at
 
 
-def _find_peak(loop: Transfer, change: Change) -> Peak:
-    tops, at, decided = find_sensitivity_peaks(as_arrays(loop), change)
-    peak = highest(tops, at)
-    return peak._replace(value=jnp.where(decided, peak.value, jnp.nan))
+def _find_peak(loop: Transfer | TracedSystem, change: Change) -> Peak:
+    loop = as_arrays(loop)
+    grid = place_frequencies(loop)
+    peak = highest(*find_sensitivity_peaks(loop, grid, change))
+    return peak._replace(value=jnp.where(grid.decided, peak.value, jnp.nan))
 
 
-def largest_singular_values(matrices: Array) -> Vector:
-    """Return the largest singular value of each matrix (k, p, m)."""
-    if 1 in matrices.shape[1:]:
-        # The square root of a sum of squares has no derivative at 0, where a response may be.
-        squares = jnp.sum(matrices.real**2 + matrices.imag**2, axis=(1, 2))
-        zero = squares == 0
-        return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squares)))
-    return jnp.linalg.svd(matrices, compute_uv=False)[:, 0]
-
-
-def _single(loop: Transfer) -> Transfer:
-    """Return a loop with one channel. Raises ValueError for another one."""
+def _single(loop: Transfer | TracedSystem) -> TracedSystem:
+    """Return a loop with one channel as arrays. Raises ValueError for another one."""
     if np.shape(loop.D) != (1, 1):
         raise ValueError(f"L has the shape {np.shape(loop.D)}: this margin is of one channel")
-    return loop
+    return as_arrays(loop)

@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.types import Array, Scalar
+from diffabs.linear.frequency.grid import FrequencyGrid, place_frequencies
 from diffabs.linear.frequency.loop_margins import Margin, find_gain_crossovers, nearest_margin
-from diffabs.linear.frequency.response import as_arrays, loop_from, respond_sensitivity
+from diffabs.linear.frequency.response import TracedSystem, as_arrays, loop_from, respond_sensitivity
 from diffabs.linear.linearization import StateSpace
 from diffabs.linear.opened_loop import OpenLoop, open_traced
-from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer
+from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE
 from diffabs.linear.zero_order_hold import discretise_held_input
 from diffabs.loop.closed_loop import Loop
 
@@ -22,7 +23,7 @@ DELAY_NEWTON_STEPS = 12
 MAX_DELAY_RESIDUE = 1e-9  # |1 + L| at a delay margin
 
 
-def open_transfer(loop: Loop, target: Scalar | None = None) -> Transfer:
+def open_transfer(loop: Loop, target: Scalar | None = None) -> TracedSystem:
     """Return the open loop L of a loop at rest on its setpoint, opened at the controls, differentiable.
 
     Parameters of the loop may be tracers. States that do not influence L have poles that do not matter.
@@ -53,7 +54,7 @@ def open_transfer(loop: Loop, target: Scalar | None = None) -> Transfer:
     return join_halves(open_traced(loop, target))
 
 
-def join_halves(halves: OpenLoop, more: Scalar = 0.0) -> Transfer:
+def join_halves(halves: OpenLoop, more: Scalar = 0.0) -> TracedSystem:
     """Return L of the halves of an open loop with `more` delay [s]; whole periods stay a pure delay."""
     plant, controller, period = as_arrays(halves.plant), as_arrays(halves.controller), halves.controller.period
     delay = jnp.asarray(halves.delay + more, jnp.result_type(float))
@@ -66,16 +67,23 @@ def join_halves(halves: OpenLoop, more: Scalar = 0.0) -> Transfer:
     b = jnp.concatenate([plant.B, jnp.zeros((m, plant.B.shape[1]))])
     c = -jnp.hstack([controller.D @ plant.C, controller.C])
     direct = jnp.zeros((len(c), b.shape[1]))
-    return _detach_unobserved(Transfer(a, b, c, direct, period, delay))
+    return _detach_unobserved(TracedSystem(a, b, c, direct, period, delay))
 
 
-def _sample(plant: Transfer, period: Scalar, delay: Scalar) -> Transfer:
+def _sample(plant: TracedSystem, period: Scalar, delay: Scalar) -> TracedSystem:
     """Return the plant with a held input that changes `delay` after each instant; the old input is a state."""
     a, b = discretise_held_input(StateSpace(plant.A, plant.B), period, delay)
-    return Transfer(a, b, jnp.pad(plant.C, ((0, 0), (0, plant.B.shape[1]))), plant.D, period)
+    return TracedSystem(
+        jnp.asarray(a),
+        jnp.asarray(b),
+        jnp.pad(plant.C, ((0, 0), (0, plant.B.shape[1]))),
+        plant.D,
+        period,
+        jnp.zeros(()),
+    )
 
 
-def _detach_unobserved(system: Transfer) -> Transfer:
+def _detach_unobserved(system: TracedSystem) -> TracedSystem:
     """Return the same L in which states that it does not contain are stable, and influence nothing."""
     linked, observed = system.A != 0, jnp.any(system.C != 0, axis=0)
     for _ in range(len(system.A)):
@@ -89,8 +97,8 @@ def _detach_unobserved(system: Transfer) -> Transfer:
 class _Place(NamedTuple):
     """A frequency [rad/s] and an added delay [s]."""
 
-    w: Scalar
-    delay: Scalar
+    w: Array
+    delay: Array
 
 
 def sampled_delay_margin(halves: OpenLoop) -> Margin:
@@ -103,7 +111,12 @@ def sampled_delay_margin(halves: OpenLoop) -> Margin:
         halves: Open loop of `open_traced` with a sampled controller and one control.
     """
     loop = join_halves(halves)
-    roots, angles, decided = find_gain_crossovers(loop)
+    return sampled_delay_margin_on(halves, loop, place_frequencies(loop))
+
+
+def sampled_delay_margin_on(halves: OpenLoop, loop: TracedSystem, grid: FrequencyGrid) -> Margin:
+    """Return the sampled delay margin of halves whose open loop and frequencies are known."""
+    roots, angles, decided = find_gain_crossovers(loop, grid)
 
     def residual(place: _Place) -> Array:
         value = 1 + loop_from(respond_sensitivity(join_halves(halves, place.delay), place.w[None]))[0, 0, 0]
@@ -119,7 +132,7 @@ def sampled_delay_margin(halves: OpenLoop) -> Margin:
             place.w - (d * first - b * second) / determinant, place.delay - (a * second - c * first) / determinant
         )
 
-    def refine(w: Scalar, delay: Scalar) -> tuple[_Place, Array]:
+    def refine(w: Array, delay: Array) -> tuple[_Place, Array]:
         start = jax.lax.stop_gradient(_Place(w, delay))
         place = jax.lax.fori_loop(0, DELAY_NEWTON_STEPS, lambda _, p: jax.lax.stop_gradient(newton(p)), start)
         return newton(jax.lax.stop_gradient(place)), jnp.max(jnp.abs(residual(jax.lax.stop_gradient(place))))

@@ -14,14 +14,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.types import Array, Bool, Scalar, Vector
+from diffabs.core.types import Array, Bool, Scalar
 
 PEAKS = 4  # highest local maxima of the grid that are refined
 CLIMBS = 40  # Newton steps or bisections to a maximum
 BISECTIONS = 60
 SAME_PEAK = 1e-6  # relative distance in frequency below which two places are one maximum
 
-FrequencyFunction = Callable[[Vector], Array]  # maps w (k,) to real values (k,)
+FrequencyFunction = Callable[[Array], Array]  # maps w (k,) to real values (k,)
 
 
 class Peak(NamedTuple):
@@ -48,22 +48,21 @@ class Roots(NamedTuple):
         complete: Whether there are no more roots on the grid than entries.
     """
 
-    w: Vector
+    w: Array
     valid: Array
     complete: Bool
 
 
-def find_peaks(function: FrequencyFunction, w: Vector, values: Vector) -> tuple[Vector, Vector]:
+def find_peaks(function: FrequencyFunction, near: FrequencyFunction, w: Array, values: Array) -> tuple[Array, Array]:
     """Return the values of the `PEAKS` highest local maxima between the ends of a grid and their frequencies.
 
-    `values` are those on the grid. Missing maxima are -inf. The values of maxima are differentiable, also twice.
+    `near` is the function but for small errors, for the search; `values` are those on the grid. Missing maxima are
+    -inf. The values of maxima are differentiable, also twice.
     """
     values = jax.lax.stop_gradient(jnp.where(jnp.isfinite(values), values, -jnp.inf))
     middle = values[1:-1]
-    heights, places = jax.lax.top_k(
-        jnp.where((middle >= values[:-2]) & (middle > values[2:]), middle, -jnp.inf), PEAKS
-    )
-    at = _climb(function, w[places], w[places + 1], w[places + 2])
+    heights, places = jax.lax.top_k(jnp.where((middle >= values[:-2]) & (middle > values[2:]), middle, -jnp.inf), PEAKS)
+    at = _climb(near, w[places], w[places + 1], w[places + 2])
     value, slope, bend = _expand(function, at)
     # f - f'^2/(2 f'') is the value at the top of the parabola. It has the first and second derivatives of the maximum.
     bend = jax.lax.stop_gradient(bend)
@@ -77,13 +76,13 @@ def find_peaks(function: FrequencyFunction, w: Vector, values: Vector) -> tuple[
     return jnp.where(jnp.any(jnp.tril(same, -1), axis=1), -jnp.inf, tops), at
 
 
-def highest(values: Vector, at: Vector) -> Peak:
+def highest(values: Array, at: Array) -> Peak:
     """Return the highest of some values as a peak."""
     top, places = jax.lax.top_k(values, 2)
     return Peak(top[0], at[places[0]], top[1])
 
 
-def _climb(function: FrequencyFunction, low: Vector, at: Vector, high: Vector) -> Vector:
+def _climb(function: FrequencyFunction, low: Array, at: Array, high: Array) -> Array:
     """Return maxima between two places each, by Newton steps on the slope; bisection where they leave the bracket."""
 
     def climb(_: object, places: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -99,21 +98,23 @@ def _climb(function: FrequencyFunction, low: Vector, at: Vector, high: Vector) -
     return jax.lax.stop_gradient(jax.lax.fori_loop(0, CLIMBS, climb, (low, at, high))[1])
 
 
-def _expand(function: FrequencyFunction, at: Vector) -> tuple[Array, Array, Array]:
+def _expand(function: FrequencyFunction, at: Array) -> tuple[Array, Array, Array]:
     """Return value, slope and second derivative of a function at some frequencies."""
 
-    def value_and_slope(w: Vector) -> tuple[Array, Array]:
+    def value_and_slope(w: Array) -> tuple[Array, Array]:
         return jax.jvp(function, (w,), (jnp.ones_like(w),))
 
     (value, slope), (_, bend) = jax.jvp(value_and_slope, (at,), (jnp.ones_like(at),))
     return value, slope, bend
 
 
-def find_roots(function: FrequencyFunction, w: Vector, values: Vector, ranks: Vector, count: int) -> Roots:
+def find_roots(
+    function: FrequencyFunction, near: FrequencyFunction, w: Array, values: Array, ranks: Array, count: int
+) -> Roots:
     """Return `count` frequencies at which a function changes its sign on a grid; differentiable.
 
-    `values` are those on the grid. Of more sign changes those with the greatest of the `ranks` (k,) are taken. A rank of
-    -inf excludes a frequency.
+    `near` and `values` are those of `find_peaks`. Of more sign changes those with the greatest of the `ranks` (k,) are
+    taken. A rank of -inf excludes a frequency.
     """
     values, ranks = jax.lax.stop_gradient((values, ranks))
     negative = values <= 0
@@ -124,7 +125,7 @@ def find_roots(function: FrequencyFunction, w: Vector, values: Vector, ranks: Ve
     def halve(_: object, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = 0.5 * (low + high)
-        before = (function(middle) <= 0) == negative[places]
+        before = (near(middle) <= 0) == negative[places]
         return jnp.where(before, middle, low), jnp.where(before, high, middle)
 
     low, high = jax.lax.stop_gradient(jax.lax.fori_loop(0, BISECTIONS, halve, (w[places], w[places + 1])))
