@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.channels import control_names
+from diffabs.core.compiling import SAME_RESULT_OPTIONS
 from diffabs.core.types import Array, Params, Scalar
 from diffabs.linear.frequency.grid import FrequencyGrid, place_frequencies
 from diffabs.linear.frequency.loop_margins import (
@@ -92,7 +93,7 @@ class FrequencyBounds:
 
     def worst(self, loop: Loop) -> dict[str, float]:
         """Return the worst value of each bounded margin over all points; NaN if the loop is unstable at one."""
-        values = jax.device_get(jax.jit(self.evaluate)(loop))
+        values = jax.device_get(jax.jit(self.evaluate, compiler_options=SAME_RESULT_OPTIONS)(loop))
         return {name: float(np.max(v) if name in AT_MOST else np.min(v)) for name, v in values.items()}
 
     def evaluate(self, loop: Loop) -> dict[str, Array]:
