@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from diffabs.tune.problem import Problem
 
 WHEN = ("before", "after")
-MARGINS = "margins"  # name of the constraints of [tune.constraints]
+MARGIN_CONSTRAINTS = "margins"  # name of the constraints of [tune.constraints]
 
 
 class Work(NamedTuple):
@@ -58,7 +58,7 @@ def build_work(scenario: Scenario) -> Work:
     if task and goal.damping:
         constraints["damping"] = Poles(task.polytope, damping=goal.damping)
     if goal.constraints.bounds():
-        constraints[MARGINS] = build_frequency_bounds(scenario)
+        constraints[MARGIN_CONSTRAINTS] = build_frequency_bounds(scenario)
     return Work(scenario, batch, constraints, task)
 
 
@@ -148,7 +148,7 @@ def with_unproved(work: Work, result: JsonObject) -> JsonObject:
     unseen = [
         {"name": name, "bound": bounds[name], "before": None, "after": None, "met": False, "missed": None}
         for name in work.constraints
-        if name not in names and name != MARGINS
+        if name not in names and name != MARGIN_CONSTRAINTS
     ]
     return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
 
@@ -175,7 +175,7 @@ def _constraints(work: Work, tuned: "Tuned", proved: Proved) -> list[JsonObject]
     for name, bound in goal.limits.items():
         before, after = (float(np.max(metrics[name])) for metrics in tuned.metrics)
         rows.append(_constraint_row(name, bound, before, after, at_most=True))
-    if bounds := work.constraints.get(MARGINS):
+    if bounds := work.constraints.get(MARGIN_CONSTRAINTS):
         from diffabs.tune.frequency_bounds import AT_MOST
 
         before, after = bounds.worst(work.scenario.loop), bounds.worst(tuned.loop)

@@ -10,27 +10,27 @@ import numpy as np
 from diffabs.core.channels import control_names
 from diffabs.core.compiling import SAME_RESULT_OPTIONS
 from diffabs.core.types import Array, Params, Scalar
-from diffabs.linear.frequency.grid import FrequencyGrid, place_frequencies
-from diffabs.linear.frequency.loop_margins import (
+from diffabs.linear.opened_loop import OpenLoop, open_traced, tracked_columns
+from diffabs.linear.responses.grid import FrequencyGrid, place_frequencies
+from diffabs.linear.responses.loop_margins import (
     Change,
     Margin,
     delay_margin_on,
     find_sensitivity_peaks,
     phase_margin_on,
 )
-from diffabs.linear.frequency.opening import join_halves, sampled_delay_margin_on
-from diffabs.linear.frequency.response import (
+from diffabs.linear.responses.opening import join_halves, sampled_delay_margin_on
+from diffabs.linear.responses.response import (
     TracedSystem,
     as_arrays,
     largest_singular_values,
     respond,
     respond_sensitivity,
 )
-from diffabs.linear.opened_loop import OpenLoop, open_traced, tracked_columns
 from diffabs.loop.batch import Batch
 from diffabs.loop.closed_loop import Loop
 
-PEAKS_BOUNDED = 3  # highest peaks of a response, each with an excess of its own: their order may change in a search
+MAX_BOUNDED_PEAKS = 3  # highest peaks of a response, each with an excess of its own: their order may change in a search
 LEAST_EXCESS = -1.0  # of a bound that is far from reached, or of a margin without a limit
 AT_MOST = ("sensitivity", "complementary", "control_noise", "shape")
 AT_LEAST = ("delay_margin", "phase_margin")
@@ -44,7 +44,7 @@ class FrequencyBounds:
     several channels has the peaks of the largest singular value, so `sensitivity=2.0` keeps the least singular value of
     the return difference above 0.5.
 
-    Derivatives are right at the peaks (`linear.frequency`). An unstable loop has excesses NaN: a search rejects a step
+    Derivatives are right at the peaks (`linear.responses`). An unstable loop has excesses NaN: a search rejects a step
     there, and its start must be stable.
 
     Attributes:
@@ -93,8 +93,7 @@ class FrequencyBounds:
 
     def worst(self, loop: Loop) -> dict[str, float]:
         """Return the worst value of each bounded margin over all points; NaN if the loop is unstable at one."""
-        values = jax.device_get(jax.jit(self.evaluate, compiler_options=SAME_RESULT_OPTIONS)(loop))
-        return {name: float(np.max(v) if name in AT_MOST else np.min(v)) for name, v in values.items()}
+        return worst_of(jax.jit(self.evaluate, compiler_options=SAME_RESULT_OPTIONS)(loop))
 
     def evaluate(self, loop: Loop) -> dict[str, Array]:
         """Return the values of each bounded margin at each point, (points, k); those that are not the worst included.
@@ -127,7 +126,7 @@ class FrequencyBounds:
         if name == "shape":  # a peak on a corner of the shape has no slope of zero, so the search misses it
             corners = jnp.array(self.shape)[:, 0]
             tops = jnp.append(tops, largest_singular_values(change(respond_sensitivity(opened, corners), corners)))
-        return jax.lax.top_k(tops, PEAKS_BOUNDED)[0]
+        return jax.lax.top_k(tops, MAX_BOUNDED_PEAKS)[0]
 
     def _weighted_sensitivity(self, name: str, loop: Loop, halves: OpenLoop) -> Change:
         """Return the function of S and of the frequency whose largest singular value is bounded."""
@@ -150,6 +149,11 @@ class FrequencyBounds:
             "shape": divide_by_shape,
         }
         return changes[name]
+
+
+def worst_of(values: Mapping[str, Array]) -> dict[str, float]:
+    """Return the worst of the values of each margin."""
+    return {name: float(np.max(v) if name in AT_MOST else np.min(v)) for name, v in values.items()}
 
 
 def _both(margin: Margin) -> Array:

@@ -34,7 +34,10 @@ INNER = {"output.explore", "output.plot", "output.report"}  # not for import by 
 def packages():
     inits = [path for ring in ROOMS for path in (ROOT / "diffabs" / ring).glob("*/__init__.py")]
     rooms = {f"{path.parents[1].name}.{path.parent.name}" for path in inits} - INNER
-    return {"diffabs", *(f"diffabs.{name}" for name in {"engine.interop", "linear", "tune", *rooms})}
+    return {
+        "diffabs",
+        *(f"diffabs.{name}" for name in {"engine.interop", "linear", "linear.responses", "tune", *rooms}),
+    }
 
 
 def pages():

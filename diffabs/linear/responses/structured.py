@@ -69,7 +69,7 @@ def structured_singular_value(matrix: AnyArray, blocks: Sequence[int], real: Seq
         Skogestad and Postlethwaite, Multivariable Feedback Control (2005), example 8.5, as a full block and diagonal:
 
         >>> import numpy as np
-        >>> from diffabs.linear.frequency import structured_singular_value
+        >>> from diffabs.linear.responses import structured_singular_value
         >>> M = np.array([[2.0, 2.0], [-1.0, -1.0]])
         >>> [f"{structured_singular_value(M, blocks).upper:.4f}" for blocks in ([2], [1, 1])]
         ['3.1623', '3.0000']
@@ -145,8 +145,8 @@ def _bound_above(matrix: Array, sizes: np.ndarray, is_real: np.ndarray) -> Scala
     def lower(_: object, state: tuple[_Scalings, Array]) -> tuple[_Scalings, Array]:
         x, t = state
         x = centre(x, t)
-        least = level(x)
-        return x, least + LEVEL_SHARE * (t - least)
+        bound = level(x)
+        return x, bound + LEVEL_SHARE * (t - bound)
 
     first = jnp.maximum(level(start), 0.0)
     scale = jnp.maximum(jnp.linalg.norm(frozen, 2) ** 2, 1e-30)

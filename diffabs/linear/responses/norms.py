@@ -5,21 +5,21 @@ import jax.numpy as jnp
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.types import Array, Bool, Scalar
-from diffabs.linear.frequency.grid import SPREADS, first_frequencies, relative_moves, spread_evenly
-from diffabs.linear.frequency.response import (
+from diffabs.linear.lyapunov import discrete_lyapunov, lyapunov
+from diffabs.linear.responses.grid import SPREADS, first_frequencies, relative_moves, spread_evenly
+from diffabs.linear.responses.response import (
     TracedSystem,
     as_arrays,
     half_sampling_rate,
     largest_singular_values,
     respond,
 )
-from diffabs.linear.frequency.search import Peak, find_peaks, highest
-from diffabs.linear.lyapunov import discrete_lyapunov, lyapunov
+from diffabs.linear.responses.search import FrequencyPeak, find_peaks, highest
 from diffabs.linear.transfer import Transfer
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
-def hinf_norm(system: Transfer | TracedSystem) -> Peak:
+def hinf_norm(system: Transfer | TracedSystem) -> FrequencyPeak:
     """Return the H-infinity norm of a stable system: the greatest singular value of its response over all frequencies.
 
     The norm of an unstable system is NaN. A delay does not change it.
@@ -32,7 +32,7 @@ def hinf_norm(system: Transfer | TracedSystem) -> Peak:
 
         >>> import numpy as np
         >>> from diffabs.linear import Transfer
-        >>> from diffabs.linear.frequency import hinf_norm
+        >>> from diffabs.linear.responses import hinf_norm
         >>> A, B = np.array([[0.0, 1.0], [-1.0, -0.2]]), np.array([[0.0], [1.0]])
         >>> print(f"{hinf_norm(Transfer(A, B, C=np.array([[1.0, 0.0]]), D=np.zeros((1, 1)))).value:.6f}")
         5.025189
@@ -70,7 +70,7 @@ def h2_norm(system: Transfer | TracedSystem) -> Scalar:
 
         >>> import numpy as np
         >>> from diffabs.linear import Transfer
-        >>> from diffabs.linear.frequency import h2_norm
+        >>> from diffabs.linear.responses import h2_norm
         >>> print(h2_norm(Transfer(np.array([[-2.0]]), np.ones((1, 1)), np.ones((1, 1)), np.zeros((1, 1)))))
         0.5
     """

@@ -5,7 +5,7 @@ A search has no derivative. At its end stands one Newton step whose frequency de
     peak    d/dw f(w, p) = 0    the value f(w(p), p) has the derivative df/dp (envelope theorem)
     root    f(w, p) = 0         dw/dp = -(df/dp)/(df/dw) (implicit function theorem)
 
-Two equal peaks have a derivative on each side only; `Peak.runner_up` shows them.
+Two equal peaks have a derivative on each side only; `FrequencyPeak.runner_up` shows them.
 """
 
 from collections.abc import Callable
@@ -16,15 +16,15 @@ import jax.numpy as jnp
 
 from diffabs.core.types import Array, Bool, Scalar
 
-PEAKS = 4  # highest local maxima of the grid that are refined
+MAX_PEAKS = 4  # highest local maxima of the grid that are refined
 CLIMBS = 40  # Newton steps or bisections to a maximum
-BISECTIONS = 60
+ROOT_HALVINGS = 60
 SAME_PEAK = 1e-6  # relative distance in frequency below which two places are one maximum
 
 FrequencyFunction = Callable[[Array], Array]  # maps w (k,) to real values (k,)
 
 
-class Peak(NamedTuple):
+class FrequencyPeak(NamedTuple):
     """The greatest value of a function of frequency.
 
     Attributes:
@@ -54,14 +54,16 @@ class Roots(NamedTuple):
 
 
 def find_peaks(function: FrequencyFunction, near: FrequencyFunction, w: Array, values: Array) -> tuple[Array, Array]:
-    """Return the values of the `PEAKS` highest local maxima between the ends of a grid and their frequencies.
+    """Return the values of the `MAX_PEAKS` highest local maxima between the ends of a grid and their frequencies.
 
     `near` is the function but for small errors, for the search; `values` are those on the grid. Missing maxima are
     -inf. The values of maxima are differentiable, also twice.
     """
     values = jax.lax.stop_gradient(jnp.where(jnp.isfinite(values), values, -jnp.inf))
     middle = values[1:-1]
-    heights, places = jax.lax.top_k(jnp.where((middle >= values[:-2]) & (middle > values[2:]), middle, -jnp.inf), PEAKS)
+    heights, places = jax.lax.top_k(
+        jnp.where((middle >= values[:-2]) & (middle > values[2:]), middle, -jnp.inf), MAX_PEAKS
+    )
     at = _climb(near, w[places], w[places + 1], w[places + 2])
     value, slope, bend = _expand(function, at)
     # f - f'^2/(2 f'') is the value at the top of the parabola. It has the first and second derivatives of the maximum.
@@ -76,10 +78,10 @@ def find_peaks(function: FrequencyFunction, near: FrequencyFunction, w: Array, v
     return jnp.where(jnp.any(jnp.tril(same, -1), axis=1), -jnp.inf, tops), at
 
 
-def highest(values: Array, at: Array) -> Peak:
+def highest(values: Array, at: Array) -> FrequencyPeak:
     """Return the highest of some values as a peak."""
     top, places = jax.lax.top_k(values, 2)
-    return Peak(top[0], at[places[0]], top[1])
+    return FrequencyPeak(top[0], at[places[0]], top[1])
 
 
 def _climb(function: FrequencyFunction, low: Array, at: Array, high: Array) -> Array:
@@ -128,7 +130,7 @@ def find_roots(
         before = (near(middle) <= 0) == negative[places]
         return jnp.where(before, middle, low), jnp.where(before, high, middle)
 
-    low, high = jax.lax.stop_gradient(jax.lax.fori_loop(0, BISECTIONS, halve, (w[places], w[places + 1])))
+    low, high = jax.lax.stop_gradient(jax.lax.fori_loop(0, ROOT_HALVINGS, halve, (w[places], w[places + 1])))
     at = 0.5 * (low + high)
     value, slope = jax.jvp(function, (at,), (jnp.ones_like(at),))
     slope = jax.lax.stop_gradient(slope)

@@ -13,7 +13,8 @@ from scipy.signal import cont2discrete
 from diffabs.core.compiling import SAME_RESULT_OPTIONS
 from diffabs.core.pytree import get, replace
 from diffabs.linear import Transfer, band, margins, multivariable_margins, open_loop
-from diffabs.linear.frequency import (
+from diffabs.linear.opened_loop import open_traced
+from diffabs.linear.responses import (
     complementary_peak,
     delay_margin,
     disk_margin,
@@ -26,11 +27,11 @@ from diffabs.linear.frequency import (
     sensitivity_peak,
     structured_singular_value,
 )
-from diffabs.linear.opened_loop import open_traced
 from diffabs.linear.stability_margins import is_stable
 from diffabs.loop.batch import Batch
 from diffabs.scenario import load
 from diffabs.tune import FrequencyBounds
+from diffabs.tune.frequency_bounds import worst_of
 
 WIDTHS = (1e-5, 1e-6, 3e-7)  # narrow: some loops are nearly unstable
 NAMES = ("sensitivity", "complementary", "gain_down", "gain_up", "phase", "delay")
@@ -79,7 +80,7 @@ def compile_quickly(function):
 
 @pytest.mark.parametrize("sampled", [False, True], ids=["continuous", "sampled"])
 @killed_by(
-    "linear.frequency.search", "step = jnp.where(usable, value, 0.0)", "step = jnp.where(usable, 0.9 * value, 0.0)"
+    "linear.responses.search", "step = jnp.where(usable, value, 0.0)", "step = jnp.where(usable, 0.9 * value, 0.0)"
 )
 def test_margins_and_their_derivatives(sampled):
     """Every margin of random loops, half of them with a delay, and its slope along a random direction."""
@@ -141,7 +142,7 @@ def test_two_equal_peaks_are_shown():
     assert peak.runner_up != peak.value
 
 
-@pytest.mark.parametrize("name", ["slip-lmi", "slip-cured"])
+@pytest.mark.parametrize("name", ["slip-cured", pytest.param("slip-lmi", marks=pytest.mark.slow)])
 def test_loops_of_scenarios(name):
     loop = load(name).loop
     path = "controller.controller.gain" if name == "slip-cured" else "controller.gain"
@@ -201,7 +202,13 @@ ROWS = """-1+6j 2-3j 3+8j 3+8j -5-9j -6+2j|4+2j -2+5j -6-7j -4+11j 8-7j 12-1j|5-
 SLICOT_MATRIX = np.array([[complex(x) for x in row.split()] for row in ROWS.split("|")] * 2)
 
 
-@pytest.mark.parametrize("real", [(True, True, False, False, False), (False,) * 5], ids=["mixed", "complex"])
+@pytest.mark.parametrize(
+    "real",
+    [
+        pytest.param((True, True, False, False, False), id="mixed"),
+        pytest.param((False,) * 5, id="complex", marks=pytest.mark.slow),
+    ],
+)
 def test_structured_singular_value(real):
     """Published value, SLICOT, both bounds, and the derivative from the dual solution."""
     blocks, kinds = [1, 1, 2, 1, 1], np.where(real, 1, 2)
@@ -227,6 +234,7 @@ def test_structured_singular_value(real):
     assert min(abs(d / slope - 1) for d in differences) < 1e-5
 
 
+@pytest.mark.slow
 def test_bounds_at_the_points_of_a_box():
     """Every bounded margin of the rig that is cured, at four corners, against NumPy's."""
     loop, over = load("slip-cured").loop, {"plant.mass": (5.3, 6.2), "initial.speed": (1.4, 13.8)}
@@ -241,7 +249,8 @@ def test_bounds_at_the_points_of_a_box():
     corners = np.array(list(itertools.product(*over.values())))
     points = Batch({path: corners[:, i] for i, path in enumerate(over)})
     bounds = FrequencyBounds(**names, shape=shape, points=points)
-    worst, expected = bounds.worst(loop), band(loop, over, samples=0).worst()
+    values, excess = compile_quickly(lambda loop: (bounds.evaluate(loop), bounds.excess(loop, {})))(loop)
+    worst, expected = worst_of(values), band(loop, over, samples=0).worst()
     for name, source in {"sensitivity": "sensitivity", "delay_margin": "delay", "phase_margin": "phase"}.items():
         system = expected[source].margins
         assert worst[name] == pytest.approx(system.numbers()[source], rel=1e-7)
@@ -255,7 +264,6 @@ def test_bounds_at_the_points_of_a_box():
         shaped.append(np.max(np.abs(s) / np.exp(np.interp(np.log(w), *np.log(shape).T))))
     assert worst["control_noise"] == pytest.approx(max(noise), rel=1e-5)
     assert worst["shape"] == pytest.approx(max(shaped), rel=1e-5)
-    excess = compile_quickly(lambda loop: bounds.excess(loop, {}))(loop)
     assert np.max(excess) == pytest.approx(
         max(1 - worst["delay_margin"] / 5e-3, worst["shape"] - 1, max(noise) / 500 - 1)
     )

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.types import Array, Scalar
-from diffabs.linear.frequency.grid import FrequencyGrid, place_frequencies
-from diffabs.linear.frequency.loop_margins import Margin, find_gain_crossovers, nearest_margin
-from diffabs.linear.frequency.response import TracedSystem, as_arrays, loop_from, respond_sensitivity
 from diffabs.linear.linearization import StateSpace
 from diffabs.linear.opened_loop import OpenLoop, open_traced
+from diffabs.linear.responses.grid import FrequencyGrid, place_frequencies
+from diffabs.linear.responses.loop_margins import Margin, find_gain_crossovers, nearest_margin
+from diffabs.linear.responses.response import TracedSystem, as_arrays, loop_from, respond_sensitivity
 from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE
 from diffabs.linear.zero_order_hold import discretise_held_input
 from diffabs.loop.closed_loop import Loop
@@ -43,7 +43,7 @@ def open_transfer(loop: Loop, target: Scalar | None = None) -> TracedSystem:
 
         >>> import jax
         >>> from diffabs.core.pytree import replace
-        >>> from diffabs.linear.frequency import open_transfer, sensitivity_peak
+        >>> from diffabs.linear.responses import open_transfer, sensitivity_peak
         >>> from diffabs.scenario import load
         >>> loop = load("slip-lmi").loop
         >>> def peak(factor):
@@ -89,8 +89,8 @@ def _detach_unobserved(system: TracedSystem) -> TracedSystem:
     for _ in range(len(system.A)):
         observed = observed | jnp.any(linked & observed[:, None], axis=0)
     a = jnp.where(observed[:, None] & observed, system.A, 0.0)
-    own = 0.0 if system.period is not None else -(jnp.sqrt(jnp.sum(jax.lax.stop_gradient(a) ** 2)) + 1.0)
-    a = a + jnp.diag(jnp.where(observed, 0.0, own))
+    detached = 0.0 if system.period is not None else -(jnp.sqrt(jnp.sum(jax.lax.stop_gradient(a) ** 2)) + 1.0)
+    a = a + jnp.diag(jnp.where(observed, 0.0, detached))
     return system._replace(A=a, B=jnp.where(observed[:, None], system.B, 0.0))
 
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.types import Array, Bool, Scalar
-from diffabs.linear.frequency.response import (
+from diffabs.linear.responses.response import (
     TracedSystem,
     closed_poles_without_delay,
     half_sampling_rate,
@@ -104,11 +104,11 @@ def spread_evenly(w: Array, *moves: Array) -> Array:
     return jnp.sort(jnp.concatenate([w, jnp.exp(jnp.interp(places, length, jnp.log(w)))]))
 
 
-def relative_moves(values: Array, least: float) -> Array:
+def relative_moves(values: Array, smallest: float) -> Array:
     """Return how far matrices (k, m, m) move between neighbours, relative to the smaller one, at most `MAX_MOVE`."""
     sizes = jnp.sqrt(jnp.sum(jnp.abs(values) ** 2, axis=(1, 2)))
     change = jnp.sqrt(jnp.sum(jnp.abs(jnp.diff(values, axis=0)) ** 2, axis=(1, 2)))
-    base = jnp.maximum(jnp.minimum(sizes[1:], sizes[:-1]), max(least, 1e-30))
+    base = jnp.maximum(jnp.minimum(sizes[1:], sizes[:-1]), max(smallest, 1e-30))
     return jnp.nan_to_num(jnp.minimum(change / base, MAX_MOVE), nan=MAX_MOVE)
 
 

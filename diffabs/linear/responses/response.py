@@ -34,7 +34,7 @@ class TracedSystem(NamedTuple):
 
 def respond(system: TracedSystem, w: Array) -> Array:
     """Return the response (k, p, m) at frequencies w (k,) [rad/s]; not finite at a pole."""
-    return (system.C @ _inverse(_shifted(system, w)) @ system.B + system.D) * _delay_factors(system, w)
+    return (system.C @ _inverse(_subtract_matrix(system, w)) @ system.B + system.D) * _delay_factors(system, w)
 
 
 def respond_sensitivity(system: TracedSystem, w: Array) -> Array:
@@ -43,7 +43,7 @@ def respond_sensitivity(system: TracedSystem, w: Array) -> Array:
     direct = jnp.linalg.inv(jnp.eye(system.D.shape[0]) + turn * system.D)
     # b and c are input and output of the closed loop, whose matrix is A - B F e C.
     b, c = system.B @ direct, turn * (direct @ system.C)
-    return direct - c @ _inverse(_shifted(system, w) + system.B @ c) @ b
+    return direct - c @ _inverse(_subtract_matrix(system, w) + system.B @ c) @ b
 
 
 def search_sensitivity(system: TracedSystem, poles: Array, closed: Array) -> Callable[[Array], Array]:
@@ -80,7 +80,7 @@ def closed_poles_without_delay(system: TracedSystem) -> Array:
     return jnp.linalg.eigvals(system.A - system.B @ jnp.linalg.solve(direct, system.C))
 
 
-def _shifted(system: TracedSystem, w: Array) -> Array:
+def _subtract_matrix(system: TracedSystem, w: Array) -> Array:
     """Return jw - A, or z - A, (k, n, n)."""
     identity = jnp.eye(system.A.shape[0])
     if system.period is None:

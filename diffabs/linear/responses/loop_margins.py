@@ -6,8 +6,8 @@ A result is NaN if the closed loop is unstable, or if the fixed number of freque
 margin that does not exist is infinite. A loop with several channels has the peaks of the largest singular value.
 
 Derivatives are those of a smooth piece: of the peak, crossover or channel that is the worst. Where two are equally bad
-the derivative is that of one of them, and on each side another; `Peak.runner_up` and `Margin.runner_up` show how near
-the next one is. A loop whose |L| touches 1 without crossing it has no crossover there.
+the derivative is that of one of them, and on each side another. `FrequencyPeak.runner_up` and `Margin.runner_up` show
+how near the next one is. A loop whose |L| touches 1 without crossing it has no crossover there.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,8 @@ import numpy as np
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.types import Array, Bool, Scalar
-from diffabs.linear.frequency.grid import FrequencyGrid, place_frequencies
-from diffabs.linear.frequency.response import (
+from diffabs.linear.responses.grid import FrequencyGrid, place_frequencies
+from diffabs.linear.responses.response import (
     TracedSystem,
     as_arrays,
     half_sampling_rate,
@@ -27,7 +27,7 @@ from diffabs.linear.frequency.response import (
     loop_from,
     respond_sensitivity,
 )
-from diffabs.linear.frequency.search import Peak, Roots, find_peaks, find_roots, highest
+from diffabs.linear.responses.search import FrequencyPeak, Roots, find_peaks, find_roots, highest
 from diffabs.linear.transfer import Transfer
 
 PHASE_CROSSOVERS = 16  # crossings of the real axis that are looked at
@@ -52,7 +52,7 @@ class Margin(NamedTuple):
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
-def sensitivity_peak(loop: Transfer | TracedSystem) -> Peak:
+def sensitivity_peak(loop: Transfer | TracedSystem) -> FrequencyPeak:
     """Return Ms, the greatest singular value of S over all frequencies; 1/Ms is the modulus margin.
 
     It is differentiable in the matrices and the delay, and works under `jit` and `vmap`.
@@ -69,7 +69,7 @@ def sensitivity_peak(loop: Transfer | TracedSystem) -> Peak:
         >>> import jax
         >>> import numpy as np
         >>> from diffabs.linear import Transfer
-        >>> from diffabs.linear.frequency import sensitivity_peak
+        >>> from diffabs.linear.responses import sensitivity_peak
         >>> A = np.array([[-10.0, -10.0, -10.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
         >>> def peak(gain):
         ...     return sensitivity_peak(Transfer(A, np.eye(3, 1), gain * np.eye(3)[2:], np.zeros((1, 1)))).value
@@ -81,7 +81,7 @@ def sensitivity_peak(loop: Transfer | TracedSystem) -> Peak:
 
 
 @compile_once(options=SAME_RESULT_OPTIONS)
-def complementary_peak(loop: Transfer | TracedSystem) -> Peak:
+def complementary_peak(loop: Transfer | TracedSystem) -> FrequencyPeak:
     """Return Mt, the greatest singular value of T over all frequencies. Arguments are those of `sensitivity_peak`."""
     return _find_peak(loop, lambda s, _: jnp.eye(s.shape[-1]) - s)
 
@@ -198,8 +198,8 @@ def nearest_margin(values: Array, at: Array, valid: Array, decided: Bool) -> Mar
     """Return the smallest of the valid values; infinity without one, NaN if nothing is decided."""
     values = jnp.where(valid, values, jnp.inf)
     first, second = jnp.argsort(values)[:2]
-    least = jnp.where(decided, values[first], jnp.nan)
-    return Margin(least, jnp.where(jnp.isfinite(least), at[first], jnp.nan), values[second])
+    value = jnp.where(decided, values[first], jnp.nan)
+    return Margin(value, jnp.where(jnp.isfinite(value), at[first], jnp.nan), values[second])
 
 
 def find_sensitivity_peaks(loop: TracedSystem, grid: FrequencyGrid, change: Change) -> tuple[Array, Array]:
@@ -226,7 +226,7 @@ def find_sensitivity_peaks(loop: TracedSystem, grid: FrequencyGrid, change: Chan
     return tops, at
 
 
-def _find_peak(loop: Transfer | TracedSystem, change: Change) -> Peak:
+def _find_peak(loop: Transfer | TracedSystem, change: Change) -> FrequencyPeak:
     loop = as_arrays(loop)
     grid = place_frequencies(loop)
     peak = highest(*find_sensitivity_peaks(loop, grid, change))
