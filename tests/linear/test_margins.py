@@ -451,7 +451,7 @@ LOOPS = {
 
 @killed_by(
     "linear.opened_loop",
-    "delay += float(sampled.delay) if sampled else 0.0",
+    "delay = delay + (sampled.delay if sampled else 0.0)",
     "pass",
     case="sampled, half a period late",
 )
