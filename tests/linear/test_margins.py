@@ -487,7 +487,7 @@ def test_the_brake_lab_rig_and_a_filtered_sensor_come_to_rest():
 
 @killed_by(
     "linear.opened_loop",
-    "delay = sum(block.time for block in blocks if isinstance(block, Delay))",
+    "delay = sum((block.time for block in blocks if isinstance(block, Delay)), 0.0)",
     "delay = 0.0",
 )
 @pytest.mark.slow
