@@ -10,6 +10,8 @@ S is computed from the matrix of the closed loop, so an integrator of L does no 
 A `TracedSystem` is a `Transfer` whose numbers may be tracers.
 """
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -60,9 +62,9 @@ def search_sensitivity(system: TracedSystem, poles: Array, closed: Array) -> Cal
 
     def respond_single(w: Array) -> Array:
         points = (1j * w if system.period is None else jnp.exp(1j * w * system.period))[:, None]
-        # The derivative of a sum of logarithms is simpler than that of a product.
-        logarithms = jnp.sum(jnp.log(points - closed) - jnp.log(points - poles), axis=1)
-        quotient = (1 + system.D[0, 0]) * jnp.exp(logarithms)
+        # A chain of products: complex logarithms are slow, and the derivative of `jnp.prod` is long.
+        factors = (points - closed) / (points - poles)
+        quotient = functools.reduce(operator.mul, factors.T, 1 + system.D[0, 0])
         return (1 / (1 + (quotient - 1) * _delay_factors(system, w)[:, 0, 0]))[:, None, None]
 
     return respond_single

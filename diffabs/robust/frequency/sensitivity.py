@@ -56,7 +56,7 @@ class FrequencyClaim(NamedTuple):
 
     Attributes:
         bound: Bound of |1/(1 + L)|, above 1; infinite to claim stability only.
-        added: The statement holds for every added delay in [0, added] [s].
+        added: The statement holds for every added delay from 0 to `added` [s].
     """
 
     bound: float
@@ -140,7 +140,7 @@ def prove_sensitivity(
         loop: Loop with one control, in continuous time or with a `Sampled` controller, with exact delays.
         over: Range (low, high) of each parameter of the box, by path, in SI units. The ends are exact decimals.
         bound: Bound to prove of |1/(1 + L)|, above 1. Infinity proves stability only.
-        added: The bound has to hold for every added delay in [0, added] [s].
+        added: The bound has to hold for every added delay from 0 to `added` [s].
         target: Setpoint; None for the loop's own, as in `linear.open_loop`.
         budget: Computing time [s].
         progress: Called with a line about how far the proof is.
