@@ -65,7 +65,7 @@ there, too.
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from diffabs.core.messages import BalanceOutput as BalanceOutput
 from diffabs.core.messages import BrakeOutput as BrakeOutput
@@ -90,8 +90,20 @@ class Road(Protocol):
         ...
 
 
+class TyreForces(NamedTuple):
+    """The forces of the road on a tyre, in the axes of the wheel.
+
+    Attributes:
+        braking: Force against the wheel's heading [N].
+        lateral: Force to the left [N].
+    """
+
+    braking: Scalar
+    lateral: Scalar
+
+
 class Tyre(Protocol):
-    """The force of a tyre, or of both tyres of an axle, in straight motion.
+    """The force of a tyre, or of both tyres of an axle.
 
     `proportional` says whether the force is proportional to the load; then one linear equation gives loads and forces.
     """
@@ -102,9 +114,13 @@ class Tyre(Protocol):
         ...
 
     def braking_force(self, slip: Scalar, load: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
-        """Return the force against the motion [N] at a `slip` [1], `load` [N], vehicle `speed` [m/s] and `distance`
-        along the road [m].
+        """Return the force against the straight motion [N] at a `slip` [1], `load` [N], vehicle `speed` [m/s] and
+        `distance` along the road [m].
         """
+        ...
+
+    def forces(self, slip: Scalar, slip_angle: Scalar, load: Scalar, speed: Scalar, distance: Scalar) -> TyreForces:
+        """Return both forces for a wheel that moves at `slip_angle` [rad] to the left of its heading."""
         ...
 
 

@@ -50,8 +50,8 @@ def test_engines_and_modes_agree_on_loops_of_channels(name, monkeypatch):
         np.testing.assert_allclose(reverse, forward, rtol=1e-9)
 
 
-# Of scenarios with several inputs: test_channels.py and test_half_car.py compare their derivatives.
-ONE_PLANT = {"QuadrupleTank", "TankStart", "HalfCar", "RoadTyre", "PacejkaTyre"}
+# Of scenarios with several inputs: test_channels.py, test_half_car.py and test_car.py compare their derivatives.
+ONE_PLANT = {"QuadrupleTank", "TankStart", "HalfCar", "Car", "RoadTyre", "PacejkaTyre"}
 
 
 def test_random_loops_have_every_part():

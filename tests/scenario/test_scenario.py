@@ -214,6 +214,7 @@ def test_members_are_told_by_shape():
         "printed-arm",
         "quadruple-tank",
         "half-car",
+        "car",
     }
     assert set(registry.family_types("initial")) == {"brake-start", "balance-start", "tank-start"}
     assert {"burckhardt", "snow", "rig-unrounded", "spline-b"} <= set(registry.family_types("road"))

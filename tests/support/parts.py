@@ -220,6 +220,7 @@ WITH_CHANNELS: dict[str, dict[str, Any]] = {
     "plant": {
         "quadruple tank": plants.QuadrupleTank(share_1=0.43, share_2=0.34),
         "half car": plants.HalfCar(drag=0.4, rolling=0.01, rear_tyre=roads.PacejkaTyre(grip=0.7)),
+        "car": plants.Car(drag=0.4, rolling=0.01, front_left_tyre=roads.PacejkaTyre(grip=0.7)),
     },
     "tyre": {"on a road": roads.RoadTyre(road=roads.WET_ASPHALT), "pacejka": roads.PacejkaTyre(grip=0.7)},
     "initial": {"filled": plants.TankStart(level_1=0.1)},

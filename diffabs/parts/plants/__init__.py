@@ -3,6 +3,7 @@
 from diffabs.parts.plants.arm_balance import ACROBOT as ACROBOT
 from diffabs.parts.plants.arm_balance import ArmBalance as ArmBalance
 from diffabs.parts.plants.arm_balance import BalanceStart as BalanceStart
+from diffabs.parts.plants.car import Car as Car
 from diffabs.parts.plants.half_car import HalfCar as HalfCar
 from diffabs.parts.plants.lab_rig import LabRig as LabRig
 from diffabs.parts.plants.mirrored_rig import MirroredRig as MirroredRig
