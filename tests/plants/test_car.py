@@ -59,7 +59,6 @@ def wheel_torques(vehicle, acceleration):
 
 
 @killed_by("parts.roads.tyres", "+ by_slip", "")
-@killed_by("parts.plants.car", "moment + x * sideways - y * forward", "moment + x * sideways")
 @killed_by("parts.plants.car", "lateral - yaw_velocity * u", "lateral")
 def test_rates_are_those_of_the_single_track_model(oracle):
     """At 1,000 random points with yaw, sideslip and steering, relative to the greatest rate of each state."""
@@ -163,6 +162,7 @@ def test_loads_are_those_of_the_accelerations(tyre):
     np.testing.assert_allclose(loads[3] - loads[2], 2 * (1 - car.roll_share) * roll / car.rear_track, rtol=1e-11)
 
 
+@killed_by("parts.plants.car", "moment + x * sideways - y * forward", "moment + x * sideways")
 def test_a_split_road_turns_the_car_to_its_better_side():
     """Jz r' is the difference of both sides' braking forces times half of the track."""
     tracks = {"front_track": 1.4, "rear_track": 1.4}
