@@ -112,7 +112,7 @@ class FrequencyConstraints:
     sensitivity: float | None = table_field(range_reader(ParameterSpec("1", low=1.0, open_low=True)), None)
     complementary: float | None = table_field(_positive_reader("1"), None)
     delay_margin: float | None = table_field(_positive_reader("s"), None)
-    phase_margin: float | None = table_field(_positive_reader("rad"), None)
+    phase_margin: float | None = table_field(range_reader(ParameterSpec("rad", 0.0, math.pi, open_low=True)), None)
     control_noise: float | None = table_field(_positive_reader("1"), None)
     shape: tuple[tuple[float, float], ...] = table_field(_read_shape, ())
     samples: int = table_field(whole_reader(0, 1000), 8)

@@ -127,6 +127,29 @@ def test_unstable_loop_has_no_margin():
     assert np.isnan(phase_margin(loop).value)
 
 
+@pytest.mark.parametrize(
+    ("loop", "margin"),
+    [
+        (Transfer(-np.eye(1), np.eye(1), np.eye(1), 2 * np.eye(1)), 0.0),  # |D| >= 1: every delay is too long
+        (Transfer(-np.eye(1), np.eye(1), np.eye(1), 0.5 * np.eye(1)), 2.0420166375518827),  # |L| = 1 at sqrt(5/3)
+        (Transfer(-np.eye(1), np.eye(1), np.eye(1), 0.5 * np.eye(1), delay=0.1), np.nan),
+        (Transfer(np.zeros((1, 1)), np.eye(1), np.eye(1), np.zeros((1, 1)), delay=-1.0), np.nan),
+    ],
+    ids=["direct", "small direct", "direct and delay", "negative delay"],
+)
+def test_delay_margin_with_a_direct_path_or_an_unfit_delay(loop, margin):
+    np.testing.assert_allclose(delay_margin(loop).value, margin, rtol=1e-6)
+
+
+def test_what_is_no_system_is_refused():
+    with pytest.raises(ValueError, match=r"D has the shape \(\): A \(n, n\)"):
+        sensitivity_peak(Transfer(-np.eye(1), np.eye(1), np.eye(1), 0.0))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="dict is no Transfer"):
+        sensitivity_peak({})  # pyright: ignore[reportArgumentType]
+    fraction = Transfer(0.5 * np.eye(1), np.eye(1), 0.5 * np.eye(1), np.zeros((1, 1)), 0.1, 0.05)
+    assert np.isnan(sensitivity_peak(fraction).value)
+
+
 def test_two_equal_peaks_are_shown():
     """Two equal channels have the same resonance; so do the two sides of a symmetric loop."""
     a = np.array([[-0.1, 1.0], [-1.0, -0.1]])

@@ -34,6 +34,7 @@ SMALL_LOOP = 1e-3  # |L| below which its own motion attracts no points
 # Of the argument of f: largest increment between two points that is resolved, and distance of the total from whole
 # quarters of a turn, in quarters.
 MAX_TURN, MAX_QUARTER_ERROR = 2.6, 0.3
+MAX_PERIOD_ERROR = 1e-6  # of a delay that counts as whole periods, in periods; it leaves room for single precision
 
 
 class FrequencyGrid(NamedTuple):
@@ -70,7 +71,16 @@ def place_frequencies(system: TracedSystem) -> FrequencyGrid:
     for _ in range(SPREADS):
         w = spread_evenly(w, relative_moves(sensitivity, 0.0), relative_moves(loop_from(sensitivity), SMALL_LOOP))
         sensitivity = respond(w)
-    return FrequencyGrid(w, sensitivity, respond, *_is_stable(system.period, poles, w, sensitivity))
+    stable, resolved = _is_stable(system.period, poles, w, sensitivity)
+    return FrequencyGrid(w, sensitivity, respond, stable, resolved & _has_fit_delay(system))
+
+
+def _has_fit_delay(system: TracedSystem) -> Bool:
+    """Return whether the delay is one that the criterion covers: no direct path behind it; whole periods if sampled."""
+    if system.period is None:
+        return (system.delay == 0) | ((system.delay > 0) & jnp.all(system.D == 0))
+    periods = system.delay / system.period
+    return (periods >= 0) & (jnp.abs(periods - jnp.round(periods)) <= MAX_PERIOD_ERROR * jnp.maximum(1.0, periods))
 
 
 def first_frequencies(system: TracedSystem, poles: Array) -> Array:

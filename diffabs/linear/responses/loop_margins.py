@@ -16,12 +16,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.types import Array, Bool, Scalar
 from diffabs.linear.responses.grid import FrequencyGrid, place_frequencies
 from diffabs.linear.responses.response import (
     TracedSystem,
     as_arrays,
+    compile_for_systems,
     half_sampling_rate,
     largest_singular_values,
     loop_from,
@@ -51,15 +51,18 @@ class Margin(NamedTuple):
     runner_up: Scalar
 
 
-@compile_once(options=SAME_RESULT_OPTIONS)
+@compile_for_systems
 def sensitivity_peak(loop: Transfer | TracedSystem) -> FrequencyPeak:
     """Return Ms, the greatest singular value of S over all frequencies; 1/Ms is the modulus margin.
 
     It is differentiable in the matrices and the delay, and works under `jit` and `vmap`.
 
     Args:
-        loop: Open loop with as many inputs as outputs, of order 1 or more. A loop with a delay in continuous time has
-            no direct path.
+        loop: Open loop L with as many inputs as outputs, of order 1 or more. With a delay in continuous time and a
+            direct path the result is NaN, and with a delay that is negative or no whole number of periods.
+
+    Raises:
+        ValueError: The loop is no `Transfer`, or its matrices do not fit each other.
 
     See also:
         `linear.margins`: All margins of one loop, in NumPy.
@@ -80,13 +83,13 @@ def sensitivity_peak(loop: Transfer | TracedSystem) -> FrequencyPeak:
     return _find_peak(loop, lambda s, _: s)
 
 
-@compile_once(options=SAME_RESULT_OPTIONS)
+@compile_for_systems
 def complementary_peak(loop: Transfer | TracedSystem) -> FrequencyPeak:
     """Return Mt, the greatest singular value of T over all frequencies. Arguments are those of `sensitivity_peak`."""
     return _find_peak(loop, lambda s, _: jnp.eye(s.shape[-1]) - s)
 
 
-@compile_once(options=SAME_RESULT_OPTIONS)
+@compile_for_systems
 def disk_margin(loop: Transfer | TracedSystem) -> Margin:
     """Return the disk margin a of a loop with one channel: 1/max |S - 1/2|.
 
@@ -97,7 +100,7 @@ def disk_margin(loop: Transfer | TracedSystem) -> Margin:
     return Margin(1 / peak.value, peak.at, 1 / jnp.maximum(peak.runner_up, 0.0))
 
 
-@compile_once(options=SAME_RESULT_OPTIONS)
+@compile_for_systems
 def gain_margins(loop: Transfer | TracedSystem) -> tuple[Margin, Margin]:
     """Return the factors of the gain (below 1, above 1) at which a loop with one channel turns unstable.
 
@@ -129,7 +132,7 @@ def gain_margins(loop: Transfer | TracedSystem) -> tuple[Margin, Margin]:
     return Margin(lower, below.at, jnp.maximum(-below.runner_up, 0.0)), above
 
 
-@compile_once(options=SAME_RESULT_OPTIONS)
+@compile_for_systems
 def phase_margin(loop: Transfer | TracedSystem) -> Margin:
     """Return the smallest angle, lag or lead, that brings a loop with one channel to -1 [rad].
 
@@ -145,11 +148,11 @@ def phase_margin_on(loop: TracedSystem, grid: FrequencyGrid) -> Margin:
     return nearest_margin(jnp.abs(angles), roots.w, roots.valid, decided)
 
 
-@compile_once(options=SAME_RESULT_OPTIONS)
+@compile_for_systems
 def delay_margin(loop: Transfer | TracedSystem) -> Margin:
     """Return the smallest added delay that makes a loop with one channel in continuous time unstable [s].
 
-    Arguments are those of `sensitivity_peak`; the loop has no direct path.
+    It is 0 with a direct path of at least 1. Arguments are those of `sensitivity_peak`.
 
     Raises:
         ValueError: The loop is sampled. `sampled_delay_margin` samples it again with each delay.
@@ -163,7 +166,10 @@ def delay_margin(loop: Transfer | TracedSystem) -> Margin:
 def delay_margin_on(loop: TracedSystem, grid: FrequencyGrid) -> Margin:
     """Return the delay margin of a loop of arrays in continuous time whose frequencies are known."""
     roots, angles, decided = find_gain_crossovers(loop, grid)
-    return nearest_margin(jnp.mod(angles, 2 * jnp.pi) / roots.w, roots.w, roots.valid, decided)
+    nearest = nearest_margin(jnp.mod(angles, 2 * jnp.pi) / roots.w, roots.w, roots.valid, decided)
+    # A delay turns the limit D of L through all angles: with |D| >= 1 it reaches -1 at once.
+    reaches = jnp.abs(loop.D[0, 0]) >= 1
+    return nearest._replace(value=jnp.where(reaches & decided, 0.0, nearest.value))
 
 
 def find_gain_crossovers(loop: TracedSystem, grid: FrequencyGrid) -> tuple[Roots, Array, Bool]:

@@ -3,13 +3,13 @@
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.types import Array, Bool, Scalar
 from diffabs.linear.lyapunov import discrete_lyapunov, lyapunov
 from diffabs.linear.responses.grid import SPREADS, first_frequencies, relative_moves, spread_evenly
 from diffabs.linear.responses.response import (
     TracedSystem,
     as_arrays,
+    compile_for_systems,
     half_sampling_rate,
     largest_singular_values,
     respond,
@@ -18,7 +18,7 @@ from diffabs.linear.responses.search import FrequencyPeak, find_peaks, highest
 from diffabs.linear.transfer import Transfer
 
 
-@compile_once(options=SAME_RESULT_OPTIONS)
+@compile_for_systems
 def hinf_norm(system: Transfer | TracedSystem) -> FrequencyPeak:
     """Return the H-infinity norm of a stable system: the greatest singular value of its response over all frequencies.
 
@@ -58,7 +58,7 @@ def hinf_norm(system: Transfer | TracedSystem) -> FrequencyPeak:
     return peak._replace(value=jnp.where(_is_stable(searched), peak.value, jnp.nan))
 
 
-@compile_once(options=SAME_RESULT_OPTIONS)
+@compile_for_systems
 def h2_norm(system: Transfer | TracedSystem) -> Scalar:
     """Return the H2 norm of a stable system, the root mean square of its output under unit white noise.
 

@@ -13,11 +13,13 @@ A `TracedSystem` is a `Transfer` whose numbers may be tracers.
 import functools
 import operator
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.types import Array, Scalar
 from diffabs.linear.lyapunov import eye, gauss_jordan_solve
 from diffabs.linear.transfer import Transfer
@@ -32,6 +34,20 @@ class TracedSystem(NamedTuple):
     D: Array
     period: Scalar | None
     delay: Array
+
+
+Result = TypeVar("Result")
+
+
+def compile_for_systems(function: Callable[..., Result]) -> Callable[[Transfer | TracedSystem], Result]:
+    """Return a function of a system that checks its shapes and compiles once for each kind of system."""
+    compiled = compile_once(options=SAME_RESULT_OPTIONS)(function)
+
+    @functools.wraps(function)
+    def call(loop: Transfer | TracedSystem) -> Result:
+        return compiled(as_arrays(loop))
+
+    return call
 
 
 def respond(system: TracedSystem, w: Array) -> Array:
@@ -129,7 +145,14 @@ def half_sampling_rate(system: TracedSystem) -> Scalar:
 
 
 def as_arrays(system: Transfer | TracedSystem) -> TracedSystem:
-    """Return a system with JAX arrays."""
+    """Return a system with JAX arrays. Raises ValueError if it is no system, or its matrices do not fit each other."""
+    if not isinstance(system, Transfer | TracedSystem):
+        raise ValueError(f"{type(system).__name__} is no Transfer: linear.from_control makes one of python-control's")
+    n, (p, m) = (np.shape(system.A) or (0,))[0], np.shape(system.D) if np.ndim(system.D) == 2 else (0, 0)
+    for name, shape in {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}.items():
+        if np.shape(getattr(system, name)) != shape or 0 in shape:
+            needed = "A (n, n), B (n, m), C (p, n) and D (p, m) are needed, n, m and p at least 1"
+            raise ValueError(f"{name} has the shape {np.shape(getattr(system, name))}: {needed}")
     dtype = jnp.result_type(float)
     a, b, c, d = (jnp.asarray(matrix, dtype) for matrix in system[:4])
     return TracedSystem(a, b, c, d, system.period, jnp.asarray(system.delay, dtype))
