@@ -25,12 +25,12 @@ WANTED = (
     *("own-objective", "own-optax", "gpu", "duckdb", "own-reference", "own-sensor", "own-actuator"),
     *("with-equinox", "with-optimistix", "with-numpyro", "with-blackjax", "with-casadi", "with-botorch"),
 )
-EXECUTED = [*JOURNEYS, "quick-start.md", "tutorials.md", "identify.md", "gradients.md", "howto/precision.md"]
+EXECUTED = [*JOURNEYS, "quick-start.md", "tutorials.md", "identify.md", "gradients.md", "howto/precision.md", "car.md"]
 SLOW = (  # which compile derivatives of many runs, or several loops, or solve programs
     *("journeys/pid-over-roads.md", "journeys/lq-against-lmi.md", "journeys/own-optax.md", "journeys/duckdb.md"),
     *("journeys/python-control.md", "journeys/own-objective.md", "journeys/pandas.md", "journeys/own-plant.md"),
     *("journeys/lanes.md", "tutorials.md", "identify.md", "gradients.md", "quick-start.md"),
-    *("journeys/gpu.md", "journeys/own-curve.md", "howto/precision.md"),
+    *("journeys/gpu.md", "journeys/own-curve.md", "howto/precision.md", "car.md"),
     *("journeys/own-reference.md", "journeys/own-sensor.md", "journeys/own-actuator.md"),
 )
 needs = {"journeys/c-export.md": "cc"}

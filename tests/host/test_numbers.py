@@ -2,7 +2,7 @@
 
 import pytest
 
-from diffabs.cli import margins, prove
+from diffabs.cli import margins, options
 from diffabs.host.values import ScenarioError
 from diffabs.output.explore.session import Session
 from diffabs.scenario import proving
@@ -23,7 +23,7 @@ def test_a_number_of_an_option_has_plain_digits(chosen, text):
     with pytest.raises(ScenarioError, match="numbers are needed"):
         proving.read_gain(f"-1,{text}", ("a", "b"))
     with pytest.raises(ScenarioError, match="is not of the form path=low:high"):
-        prove._read_sides([f"plant.mass=5:{text}"], chosen)
+        options.read_sides([f"plant.mass=5:{text}"], chosen)
 
 
 @pytest.mark.parametrize("text", STRANGE)

@@ -149,7 +149,7 @@ def as_arrays(system: Transfer | TracedSystem) -> TracedSystem:
     if not isinstance(system, Transfer | TracedSystem):
         raise ValueError(f"{type(system).__name__} is no Transfer: linear.from_control makes one of python-control's")
     n, (p, m) = (np.shape(system.A) or (0,))[0], np.shape(system.D) if np.ndim(system.D) == 2 else (0, 0)
-    for name, shape in {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}.items():
+    for name, shape in {"D": (p, m), "A": (n, n), "B": (n, m), "C": (p, n)}.items():
         if np.shape(getattr(system, name)) != shape or 0 in shape:
             needed = "A (n, n), B (n, m), C (p, n) and D (p, m) are needed, n, m and p at least 1"
             raise ValueError(f"{name} has the shape {np.shape(getattr(system, name))}: {needed}")
