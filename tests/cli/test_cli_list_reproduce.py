@@ -43,13 +43,9 @@ def test_list_knows_every_part():
 def test_list_table_shows_units_and_ranges():
     text = run("list", "plants").stdout
     row = next(line for line in text.splitlines() if " mass " in line and " 5.3 " in line)
-    assert [cell.strip() for cell in row.split("│")[2:-1]] == [
-        "mass",
-        "5.3",
-        "kg",
-        "(0, inf)",
-        "Mass m of the vehicle on the wheel.",
-    ]
+    *numbers, text_of_mass = (cell.strip() for cell in row.split("│")[2:-1])
+    assert numbers == ["mass", "5.3", "kg", "(0, inf)"]
+    assert text_of_mass.startswith("Mass m of the vehicle")  # the terminal may wrap it
     assert "[0, 1]" in text
     assert "snow" not in text
     assert "[dry-asphalt, snow]" in run("list", "roads").stdout
