@@ -46,6 +46,7 @@ Optional methods or attributes of a part's class, beyond its contract:
     plant          usual_parts(), usual_objectives()    defaults of a scenario: the other parts of the loop, the metrics
                    audit(initial)                       an objective that exceeds 1 in a physically impossible run
                    probes(initial, setpoint, stop)      starts (k,) at which its loop may be stiffest
+                   least_scales()                       sizes of states below which adaptive steps have absolute errors
                    frozen = ("speed", ...)              outputs that a linear model of its first output holds constant
                    controls                             NamedTuple with `units` of several inputs, for `control_unit`
     output         highest                              greatest possible value of the first output

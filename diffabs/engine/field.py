@@ -258,6 +258,10 @@ class FieldSystem:
         del state
         return ()
 
+    def least_scales(self, state: FieldState) -> None:
+        """Return None: errors are relative."""
+        del state
+
     def next_tick(self, k: Int, h: Scalar) -> Int:
         """Raise a TypeError: a field has no clock."""
         raise TypeError(f"a field has no clock; asked for the tick after {k} on a grid of {h}")

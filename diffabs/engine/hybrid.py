@@ -136,6 +136,13 @@ class HybridSystem(Protocol):
         """
         ...
 
+    def least_scales(self, state: Any) -> PyTree | None:
+        """Return for each number of `state.flow()` the size below which an adaptive step may have an absolute error.
+
+        Without (None) the error is relative to the size from the first step on, even to one near rounding.
+        """
+        ...
+
     def next_tick(self, k: Int, h: Scalar) -> Int:
         """Return the number of the first instant after the `k`-th at which a clock ticks, with a grid of `h` [s]."""
         ...

@@ -170,6 +170,12 @@ class Loop(LoopParts):
         """Return the plant's outputs that have a target."""
         return tracked_outputs(self.plant.output(state.plant))
 
+    def least_scales(self, state: LoopState) -> tuple[PyTree, ...] | None:
+        """Return the plant's least scales, with zeros for the blocks; None if the plant has none."""
+        if not hasattr(self.plant, "least_scales"):
+            return None
+        return self.plant.least_scales(), *jax.tree.map(jnp.zeros_like, state.flow()[1:])
+
     @property
     def changes(self) -> bool:
         """Whether a block has ticks or events."""

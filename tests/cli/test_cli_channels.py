@@ -119,10 +119,7 @@ def test_the_page_is_the_example():
 @pytest.fixture
 def rooms(monkeypatch):
     monkeypatch.syspath_prepend(str(HERE))
-    before = dict(vars(outside).get("_modules", {}))
-    yield
-    vars(outside).get("_modules", {}).clear()
-    vars(outside).get("_modules", {}).update(before)
+    replace_seam(monkeypatch, "outside_named", {})
 
 
 def test_the_two_rooms_of_the_page(rooms):

@@ -10,8 +10,9 @@ from mutants import killed_by
 from scipy.integrate import solve_ivp
 
 import diffabs as d
-from diffabs.core.pytree import param, pytree
+from diffabs.core.pytree import param, pytree, static
 from diffabs.engine.drive.runs import run_system
+from diffabs.engine.step.event_location import RunStatus
 
 A = np.array([[0.9, 0.2], [-0.3, 0.8]])
 
@@ -71,6 +72,26 @@ class System:
 
     def error_controlled_signals(self, state):
         return ()
+
+    def least_scales(self, state):
+        return None
+
+
+@pytree
+class Decay(System):
+    """x' = -r x, beside a number that only rounds."""
+
+    decay: Any = param(default=1.0, unit="1/s", free=True)
+    sizes: Any = static(default=None)
+
+    def start(self):
+        return Numbers((jnp.asarray(1.0), jnp.asarray(0.0)))
+
+    def flow(self, t, state, signals):
+        return (-self.decay * state.x[0], 1e-30 * jnp.cos(1e8 * t))
+
+    def least_scales(self, state):
+        return self.sizes
 
 
 @pytree
@@ -173,6 +194,12 @@ def last_state(system, objectives, carry):
     return carry.point.state, None
 
 
+def last_state_at_the_end(system, objectives, carry):
+    """NaN for a run that was given up."""
+    over = carry.status == RunStatus.EXHAUSTED
+    return jax.tree.map(lambda x: jnp.where(over, jnp.nan, x), carry.point.state), None
+
+
 @pytest.mark.parametrize(
     "solver", [d.FixedStep(0.5, 10.0), pytest.param(d.Adaptive(1e-6, 10.0, step=0.5), marks=pytest.mark.slow)]
 )
@@ -186,6 +213,14 @@ def test_a_difference_equation_has_a_clock_and_no_flow(solver):
     slope = jax.jvp(end, (jnp.asarray(A),), (jnp.eye(2),))[1]
     exact = 19 * np.linalg.matrix_power(A, 18) @ [1.0, 0.0]  # d (A + s I)^19/ds
     np.testing.assert_allclose(slope, exact, rtol=1e-12)
+
+
+@killed_by("engine.step.step_size", "jax.tree.map(jnp.maximum, states, least)", "states")
+@pytest.mark.parametrize(("sizes", "end"), [(None, np.nan), ((0.0, 1.0), np.exp(-1.0))], ids=["relative", "absolute"])
+def test_rounding_near_zero_does_not_shorten_the_steps(sizes, end):
+    """Without a least size the error is relative to the rounding, and the run needs too many steps."""
+    solver = d.Adaptive(1e-6, 1.0, step=0.5)
+    np.testing.assert_allclose(run_system(Decay(decay=jnp.asarray(1.0), sizes=sizes), solver, last_state_at_the_end).x[0], end, rtol=1e-6)
 
 
 @pytest.mark.slow

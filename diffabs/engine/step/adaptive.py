@@ -44,6 +44,7 @@ from diffabs.engine.step.step_size import (
     MIN_STEP_RATIO,
     error_norm,
     error_scales,
+    first_error_scales,
     plan_step,
     propose_length,
     shortest_step,
@@ -202,7 +203,7 @@ class AdaptiveStepping:
         carry = start_carry(self, hybrid, objectives, key, foresee)
         point, zero, no = carry.point, carry.k, carry.unrestricted
         state = borrow(point.state, None)
-        scale = error_scales(state, point.sample)
+        scale = first_error_scales(hybrid, state, point.sample)
         limit = self.h * self.steps  # until the first `renew`, before the first attempt
         to_strike = self._next_strike(hybrid, zero) * self.h
         length, strikes = plan_step(error_limited, self._time_ahead(point), to_strike)

@@ -33,6 +33,13 @@ def error_scales(state: HybridState, sample: HybridSample) -> PyTree:
     return sample.signal_scales(), jax.tree.map(jnp.abs, state.flow())
 
 
+def first_error_scales(hybrid: HybridSystem, state: HybridState, sample: HybridSample) -> PyTree:
+    """Return the scales at the start of a run, at least those of the system."""
+    signals, states = error_scales(state, sample)
+    least = hybrid.least_scales(state)
+    return signals, states if least is None else jax.tree.map(jnp.maximum, states, least)
+
+
 def error_norm(
     hybrid: HybridSystem, state: HybridState, state_errors: PyTree, scale: PyTree, sample: HybridSample
 ) -> Array:

@@ -30,7 +30,7 @@ import jax.numpy as jnp
 
 from diffabs.core.channels import put_first
 from diffabs.core.numerics import larger, quotient
-from diffabs.core.protocols import BrakeOutput, Objective, Tyre
+from diffabs.core.protocols import BrakeOutput, Objective, Tyre, TyreForces
 from diffabs.core.pytree import param, part, pytree, static
 from diffabs.core.types import Any, PyTree, Scalar
 from diffabs.parts.controllers import PID, Clamping, NoFeedforward, PerChannel
@@ -157,6 +157,9 @@ class CarForces(NamedTuple):
     moment: Scalar
 
 
+ForceOfLoad = Callable[[Scalar], TyreForces]
+
+
 @pytree
 class Car:
     """A car with four braked wheels that may yaw and slide, and steering.
@@ -231,8 +234,11 @@ class Car:
         del t
         *torques, steer = control
         contacts = self._contacts(state)
-        loads = self.loads(sum(torques) / self.radius, 0.0) if self.commanded else self._solve_loads(state, contacts)
-        road = self._forces(contacts, loads, state)
+        forces_of_loads = self._forces_of_loads(contacts, state)
+        loads = (
+            self.loads(sum(torques) / self.radius, 0.0) if self.commanded else self._solve_loads(forces_of_loads, state)
+        )
+        road = self._sum_forces(forces_of_loads, loads, state)
         u, v, yaw_velocity = state.longitudinal_velocity, state.lateral_velocity, state.yaw_velocity
         longitudinal, lateral = self._accelerations(state, road)
         spins = [
@@ -250,6 +256,10 @@ class Car:
             Wheels(*spins),
         )
 
+    def least_scales(self) -> CarState:
+        """Return the sizes below which errors are absolute: in straight motion y, yaw and steer angle are rounding."""
+        return CarState(1.0, 1.0, 0.1, 1.0, 0.1, 0.1, 0.1, Wheels(1.0, 1.0, 1.0, 1.0))
+
     def project(self, state: CarState) -> CarState:
         """Return the state with neither car nor wheels moving backwards."""
         return state._replace(
@@ -260,8 +270,9 @@ class Car:
     def output(self, state: CarState) -> CarOutput:
         """Return slips, wheel speeds, loads, accelerations and motion of the car."""
         contacts = self._contacts(state)
-        loads = self._solve_loads(state, contacts)
-        longitudinal, lateral = self._accelerations(state, self._forces(contacts, loads, state))
+        forces_of_loads = self._forces_of_loads(contacts, state)
+        loads = self._solve_loads(forces_of_loads, state)
+        longitudinal, lateral = self._accelerations(state, self._sum_forces(forces_of_loads, loads, state))
         return CarOutput(
             *contacts.slips,
             *contacts.rims,
@@ -281,8 +292,8 @@ class Car:
         """Return the torques R F + (1 - slip) J u'/R [N m] at which all wheels hold their slips in straight motion."""
         slips = Wheels(*(getattr(target, name) for name in BRAKES.values()))
         straight = self.start(BrakeStart(speed=output.speed, slip=0.0))._replace(x=output.distance)
-        contacts = self._contacts(straight)._replace(slips=slips)
-        road = self._forces(contacts, self._solve_loads(straight, contacts), straight)
+        forces_of_loads = self._forces_of_loads(self._contacts(straight)._replace(slips=slips), straight)
+        road = self._sum_forces(forces_of_loads, self._solve_loads(forces_of_loads, straight), straight)
         deceleration = -self._accelerations(straight, road)[0]
         torques = [
             self.radius * force + (1 - slip) * inertia * deceleration / self.radius
@@ -292,16 +303,9 @@ class Car:
 
     def loads(self, braking: Scalar, lateral: Scalar) -> Wheels:
         """Return the vertical forces of the wheels [N] under the road's forces X and Y [N]."""
-        weight, shift = self.mass * GRAVITY, self.height * braking
-        wheelbase = 2 * (self.to_front + self.to_rear)
-        front, rear = (weight * self.to_rear + shift) / wheelbase, (weight * self.to_front - shift) / wheelbase
-        roll = self.height * lateral
-        front_roll, rear_roll = (
-            self.roll_share * roll / self.front_track,
-            (1 - self.roll_share) * roll / self.rear_track,
+        return Wheels(
+            *(larger(still + by_x * braking + by_y * lateral, 0.0) for still, by_x, by_y in self._load_terms())
         )
-        each = (front - front_roll, front + front_roll, rear - rear_roll, rear + rear_roll)
-        return Wheels(*(larger(load, 0.0) for load in each))
 
     def energy(self, state: CarState) -> Scalar:
         """Return the kinetic energy of car and wheels in a `state` [J]."""
@@ -328,6 +332,23 @@ class Car:
         }
         return {"stop_time": StopTime(), "stop_distance": StopDistance(), **locked}
 
+    def _load_terms(self) -> tuple[tuple[Scalar, Scalar, Scalar], ...]:
+        """Return the load of each wheel at rest [N], and how much X and Y add to it [N/N]."""
+        weight, wheelbase = self.mass * GRAVITY, 2 * (self.to_front + self.to_rear)
+        front, rear, pitch = (
+            weight * self.to_rear / wheelbase,
+            weight * self.to_front / wheelbase,
+            self.height / wheelbase,
+        )
+        front_roll = self.roll_share * self.height / self.front_track
+        rear_roll = (1 - self.roll_share) * self.height / self.rear_track
+        return (
+            (front, pitch, -front_roll),
+            (front, pitch, front_roll),
+            (rear, -pitch, -rear_roll),
+            (rear, -pitch, rear_roll),
+        )
+
     def _inertias(self) -> tuple[Scalar, ...]:
         return (self.front_wheel_inertia, self.front_wheel_inertia, self.rear_wheel_inertia, self.rear_wheel_inertia)
 
@@ -349,34 +370,46 @@ class Car:
     def _contacts(self, state: CarState) -> Contacts:
         """Return how the wheels move on the road, in their own axes."""
         slips, angles, rims, places = [], [], [], []
-        steers = (state.steer, state.steer, 0.0, 0.0)
-        for (x, y), steer, spin in zip(self._positions(), steers, state.spins, strict=True):
-            u = state.longitudinal_velocity - state.yaw_velocity * y
-            v = state.lateral_velocity + state.yaw_velocity * x
-            along = u * jnp.cos(steer) + v * jnp.sin(steer)
-            across = v * jnp.cos(steer) - u * jnp.sin(steer)
+        cosine, sine = jnp.cos(state.yaw), jnp.sin(state.yaw)
+        for (x, y), steer, spin in zip(self._positions(), _steers(state), state.spins, strict=True):
+            along = state.longitudinal_velocity - state.yaw_velocity * y
+            across = state.lateral_velocity + state.yaw_velocity * x
+            if steer is not None:
+                u, v = along, across
+                along, across = u * jnp.cos(steer) + v * jnp.sin(steer), v * jnp.cos(steer) - u * jnp.sin(steer)
             rim = self.radius * spin
             slips.append(slip_ratio(along, rim, self.crawl_speed))
             angles.append(jnp.arctan(across / larger(along, self.crawl_speed)))
             rims.append(rim)
-            places.append(state.x + x * jnp.cos(state.yaw) - y * jnp.sin(state.yaw))
+            places.append(state.x + x * cosine - y * sine)
         return Contacts(Wheels(*slips), Wheels(*angles), Wheels(*rims), Wheels(*places))
 
-    def _forces(self, contacts: Contacts, loads: Wheels, state: CarState) -> CarForces:
+    def _forces_of_loads(self, contacts: Contacts, state: CarState) -> list[ForceOfLoad]:
+        """Return the force of each wheel as a function of its load; proportional tyres are evaluated here, once."""
+        speed = self._total_velocity(state)
+        return [
+            _force_of_load(tyre, slip, slip_angle, speed, place)
+            for tyre, slip, slip_angle, place in zip(
+                self._tyres(), contacts.slips, contacts.slip_angles, contacts.places, strict=True
+            )
+        ]
+
+    def _sum_forces(self, forces_of_loads: list[ForceOfLoad], loads: Wheels, state: CarState) -> CarForces:
         """Return the forces of the road under the loads."""
-        speed, braking = self._total_velocity(state), []
-        longitudinal = lateral = moment = 0.0
-        turns = (state.steer, state.steer, 0.0, 0.0)
-        wheels = zip(self._tyres(), self._positions(), turns, contacts.slips, contacts.slip_angles, loads,
-                     contacts.places, strict=True)  # fmt: skip
-        for tyre, (x, y), steer, slip, slip_angle, load, place in wheels:
-            force = tyre.forces(slip, slip_angle, load, speed, place)
-            forward = -force.braking * jnp.cos(steer) - force.lateral * jnp.sin(steer)
-            sideways = force.lateral * jnp.cos(steer) - force.braking * jnp.sin(steer)
-            longitudinal, lateral = longitudinal + forward, lateral + sideways
-            moment = moment + x * sideways - y * forward
-            braking.append(force.braking)
-        return CarForces(Wheels(*braking), longitudinal - self._rolling_force(state), lateral, moment)
+        forces = [force_of_load(load) for force_of_load, load in zip(forces_of_loads, loads, strict=True)]
+        turned = [_turn_force(force, steer) for force, steer in zip(forces, _steers(state), strict=True)]
+        left, right, rear_left, rear_right = turned
+        # Differences of left and right: the moment of a car in straight motion is exactly 0.
+        moment = (
+            self.to_front * (left.lateral + right.lateral)
+            - self.to_rear * (rear_left.lateral + rear_right.lateral)
+            + 0.5 * self.front_track * (left.braking - right.braking)
+            + 0.5 * self.rear_track * (rear_left.braking - rear_right.braking)
+        )
+        braking, lateral = (sum(getattr(force, name) for force in turned) for name in TyreForces._fields)
+        return CarForces(
+            Wheels(*(force.braking for force in forces)), -braking - self._rolling_force(state), lateral, moment
+        )
 
     def _rolling_force(self, state: CarState) -> Scalar:
         """Return f m g while the car moves."""
@@ -388,27 +421,48 @@ class Car:
         drag = self.drag * state.longitudinal_velocity**2
         return quotient(road.longitudinal - drag, self.mass), quotient(road.lateral, self.mass)
 
-    def _solve_loads(self, state: CarState, contacts: Contacts) -> Wheels:
-        """Return the loads that belong to the forces that they cause."""
+    def _solve_loads(self, forces_of_loads: list[ForceOfLoad], state: CarState) -> Wheels:
+        """Return the loads that belong to the forces that they cause, by Newton's steps from X = Y = 0."""
+        steers, rolling = _steers(state), self._rolling_force(state)
+        x = y = 0.0 * state.longitudinal_velocity
+        for _ in range(SOLVE_STEPS[all(tyre.proportional for tyre in self._tyres())]):
+            f, fx, fy, g, gx, gy = rolling - x, -1.0, 0.0, -y, 0.0, -1.0
+            for force_of_load, (still, by_x, by_y), steer in zip(
+                forces_of_loads, self._load_terms(), steers, strict=True
+            ):
+                load = still + by_x * x + by_y * y
+                loaded = jnp.where(load > 0, 1.0, 0.0)
+                force, slope = jax.jvp(
+                    lambda load, force_of_load=force_of_load, steer=steer: _turn_force(force_of_load(load), steer),
+                    (larger(load, 0.0),),
+                    (loaded,),
+                )
+                f, fx, fy = f + force.braking, fx + slope.braking * by_x, fy + slope.braking * by_y
+                g, gx, gy = g + force.lateral, gx + slope.lateral * by_x, gy + slope.lateral * by_y
+            determinant = fx * gy - fy * gx
+            x, y = x - quotient(f * gy - g * fy, determinant), y - quotient(g * fx - f * gx, determinant)
+        return self.loads(x, y)
 
-        def excess(braking: Scalar, lateral: Scalar) -> tuple[Scalar, Scalar]:
-            road = self._forces(contacts, self.loads(braking, lateral), state)
-            return -road.longitudinal - braking, road.lateral - lateral
 
-        steps = SOLVE_STEPS[all(tyre.proportional for tyre in self._tyres())]
-        zero = 0.0 * state.longitudinal_velocity
-        return self.loads(*_newton_root(excess, (zero, zero), steps))
+def _steers(state: CarState) -> tuple[Scalar | None, ...]:
+    """Return the steer angle of each wheel; None for one that does not steer."""
+    return state.steer, state.steer, None, None
 
 
-def _newton_root(
-    function: Callable[[Scalar, Scalar], tuple[Scalar, Scalar]], start: tuple[Scalar, Scalar], steps: int
-) -> tuple[Scalar, Scalar]:
-    """Return the root of two functions of two numbers after a fixed number of Newton's steps."""
-    x, y = start
-    for _ in range(steps):
-        unit, zero = jnp.ones_like(x), jnp.zeros_like(x)
-        (f, g), slope = jax.linearize(function, x, y)
-        (fx, gx), (fy, gy) = slope(unit, zero), slope(zero, unit)
-        determinant = fx * gy - fy * gx
-        x, y = x - quotient(f * gy - g * fy, determinant), y - quotient(g * fx - f * gx, determinant)
-    return x, y
+def _turn_force(force: TyreForces, steer: Scalar | None) -> TyreForces:
+    """Return the force of a steered wheel in the axes of the car."""
+    if steer is None:
+        return force
+    cosine, sine = jnp.cos(steer), jnp.sin(steer)
+    return TyreForces(
+        force.braking * cosine + force.lateral * sine,
+        force.lateral * cosine - force.braking * sine,
+    )
+
+
+def _force_of_load(tyre: Tyre, slip: Scalar, slip_angle: Scalar, speed: Scalar, place: Scalar) -> ForceOfLoad:
+    """Return the force of a tyre as a function of its load."""
+    if not tyre.proportional:
+        return lambda load: tyre.forces(slip, slip_angle, load, speed, place)
+    friction = tyre.forces(slip, slip_angle, 1.0, speed, place)
+    return lambda load: TyreForces(load * friction.braking, load * friction.lateral)
