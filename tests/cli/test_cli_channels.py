@@ -8,10 +8,10 @@ import pytest
 from commands import assert_one_error_line, run
 from mutants import killed_by
 from project import ROOT
+from seams import replace_seam
 
 from diffabs.loop.batch import Batch
 from diffabs.loop.ensemble import run_batch
-from diffabs.scenario import outside
 from diffabs.scenario.scenario import dump, load, loads
 
 HERE = ROOT / "examples" / "two-inputs"

@@ -15,6 +15,7 @@ from diffabs import actuators, controllers, objectives, references, stops
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import param, pytree
 from diffabs.parts.objectives import SettlingTime, at_limits
+from diffabs.parts.plants import Car
 from diffabs.scenario.tuning import numbers_at_bounds
 
 
@@ -140,3 +141,9 @@ def test_a_tuning_says_on_which_bounds_it_stands():
         "controller.kp": {"after": 7.0, "low": 0.0, "high": math.inf},
     }
     assert list(numbers_at_bounds(free)) == ["controller.gain.0 (lower, -10000)", "reference.slip (upper, 0.35)"]
+
+
+def test_a_control_without_a_channel_has_no_limits():
+    """The steer angle of a car whose brakes have limits."""
+    limits = at_limits(d.Loop(plant=Car(), **Car().usual_parts()))
+    np.testing.assert_array_equal(limits.high, [2000.0] * 4 + [np.inf])

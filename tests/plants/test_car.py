@@ -162,7 +162,7 @@ def test_loads_are_those_of_the_accelerations(tyre):
     np.testing.assert_allclose(loads[3] - loads[2], 2 * (1 - car.roll_share) * roll / car.rear_track, rtol=1e-11)
 
 
-@killed_by("parts.plants.car", "0.5 * self.front_track * (left.braking", "0.0 * self.front_track * (left.braking")
+@killed_by("parts.plants.car", "0.5 * self.front_track * (", "0.0 * self.front_track * (")
 def test_a_split_road_turns_the_car_to_its_better_side():
     """Jz r' is the difference of both sides' braking forces times half of the track."""
     tracks = {"front_track": 1.4, "rear_track": 1.4}

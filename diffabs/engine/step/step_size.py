@@ -36,8 +36,8 @@ def error_scales(state: HybridState, sample: HybridSample) -> PyTree:
 def first_error_scales(hybrid: HybridSystem, state: HybridState, sample: HybridSample) -> PyTree:
     """Return the scales at the start of a run, at least those of the system."""
     signals, states = error_scales(state, sample)
-    least = hybrid.least_scales(state)
-    return signals, states if least is None else jax.tree.map(jnp.maximum, states, least)
+    least_scales = hybrid.least_scales(state)
+    return signals, states if least_scales is None else jax.tree.map(jnp.maximum, states, least_scales)
 
 
 def error_norm(

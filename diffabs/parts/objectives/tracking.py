@@ -320,8 +320,9 @@ def _tightest_limits(loop: Part, channel: str) -> tuple[Scalar, Scalar]:
     while pending:
         component: Part = pending.pop()
         # Controllers may contain controllers (`Sampled`), so the search descends into all parts.
-        side_by_side = isinstance(component, Parallel) and channel in component.by_channel()
-        pending.extend([component.by_channel()[channel]] if side_by_side else parts(component))
+        pending.extend(
+            _parts_of_channel(component, channel, loop.plant.controls._fields) if channel else parts(component)
+        )
         if limits := getattr(component, "limits", None):
             below, above = limits()
             if np.ndim(below):  # of a controller with several commands
@@ -329,6 +330,13 @@ def _tightest_limits(loop: Part, channel: str) -> tuple[Scalar, Scalar]:
                 below, above = below[place], above[place]
             low, high = larger(low, below), smaller(high, above)
     return low, high
+
+
+def _parts_of_channel(component: Part, channel: str, controls: tuple[str, ...]) -> list[Part]:
+    """Return the parts of a component that act on one of the `controls`."""
+    if isinstance(component, Parallel) and component.by_channel().keys() <= {*controls}:
+        return [block for name, block in component.by_channel().items() if name == channel]
+    return [*parts(component)]
 
 
 @pytree

@@ -398,12 +398,12 @@ class Car:
         """Return the forces of the road under the loads."""
         forces = [force_of_load(load) for force_of_load, load in zip(forces_of_loads, loads, strict=True)]
         turned = [_turn_force(force, steer) for force, steer in zip(forces, _steers(state), strict=True)]
-        left, right, rear_left, rear_right = turned
-        # Differences of left and right: the moment of a car in straight motion is exactly 0.
+        front_left, front_right, rear_left, rear_right = turned
+        # Differences of both sides: the moment of a car in straight motion is exactly 0.
         moment = (
-            self.to_front * (left.lateral + right.lateral)
+            self.to_front * (front_left.lateral + front_right.lateral)
             - self.to_rear * (rear_left.lateral + rear_right.lateral)
-            + 0.5 * self.front_track * (left.braking - right.braking)
+            + 0.5 * self.front_track * (front_left.braking - front_right.braking)
             + 0.5 * self.rear_track * (rear_left.braking - rear_right.braking)
         )
         braking, lateral = (sum(getattr(force, name) for force in turned) for name in TyreForces._fields)
