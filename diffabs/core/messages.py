@@ -216,7 +216,8 @@ class Segment(NamedTuple):
 
     def output(self, read: Callable[[PyTree], Scalar] = lambda output: output[0]) -> Cubic:
         """Return the cubic of `read`(output), by default of the first plant output."""
-        return self.shown_cubic(lambda shown: read(shown.output))
+        slopes = (jax.tree.map(lambda rate: self.h * rate, rates.output) for rates in self.shown_rates())
+        return _read_cubic(read, (self.start.show().output, self.end.show().output), slopes)
 
     def error(self) -> Cubic:
         """Return the cubic of the first plant output minus its setpoint, which a reference may move within a step."""

@@ -481,4 +481,4 @@ def test_every_part_is_differentiated_in_some_loop():
         if dataclasses.is_dataclass(part) and isinstance(part, type)
     }
     # Runs of cars take a minute to compile; tests/plants/test_half_car.py and test_car.py differentiate them.
-    assert offered - used == {"Car", "HalfCar", "PacejkaTyre", "RoadTyre"}
+    assert offered - used == {"Car", "HalfCar", "HoldCourse", "PacejkaTyre", "RoadTyre"}

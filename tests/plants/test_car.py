@@ -1,12 +1,14 @@
 """The car of seven degrees of freedom against CommonRoad's single-track model, the half car, closed forms and SciPy."""
 
 import math
+import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from mutants import killed_by
+from project import ROOT
 from scipy.integrate import solve_ivp
 
 import diffabs as d
@@ -15,6 +17,7 @@ from diffabs.core.pytree import get, replace
 from diffabs.parts.plants import GRAVITY, BrakeStart, Car, HalfCar
 from diffabs.parts.plants.car import BRAKES, WHEELS, CarControls, CarState, Wheels
 from diffabs.parts.plants.half_car import AxleBrakes, HalfCarState
+from diffabs.scenario import load
 
 SNOW = roads.RoadTyre(road=roads.SNOW)
 SPLIT = Car(front_right_tyre=SNOW, rear_right_tyre=SNOW, drag=0.4, rolling=0.012)
@@ -281,3 +284,56 @@ def test_derivatives_are_those_of_differences(mode):
             difference = (8 * (close - near) - (distant - far)) / (12 * h)
             scale = np.max(np.abs(derivative[:, i]))
             np.testing.assert_allclose(derivative[:, i], difference, rtol=1e-6, atol=1e-7 * scale)
+
+
+# The scenarios
+
+
+@pytest.mark.slow
+def test_in_a_run_on_a_straight_road_it_is_the_half_car():
+    """Also at a small error: y, yaw and steer angle stay zero, or near rounding."""
+    for rtol in ("1e-6", "1e-8"):
+        car, half = (load(name, [f"solver.rtol={rtol}"]) for name in ("car-straight", "half-car"))
+        run = d.measure(car.loop, car.solver, car.objectives)
+        distance = d.measure(half.loop, half.solver, {"distance": half.objectives["stop_distance"]}).metrics["distance"]
+        assert not run.diverged
+        np.testing.assert_allclose(run.metrics["stop_distance"], distance, rtol=1e-8)
+        assert run.metrics["max_yaw"] < 1e-6
+        assert run.metrics["max_steer"] < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("groups", ["", "[]"], ids=["select-low", "each wheel"])
+def test_the_page_tells_how_far_a_car_turns_on_a_split_road(groups):
+    text = (ROOT / "docs" / "car.md").read_text(encoding="utf-8")
+    row = [line for line in text.splitlines() if " m | " in line and " rad" in line][bool(groups)]
+    told = [float(number) for number in re.findall(r"([\d.]+) (?:m|rad)\b", row)]
+    scenario = load("car-split", [f"controller.controller.groups={groups}"] if groups else [])
+    metrics = d.measure(scenario.loop, scenario.solver, scenario.objectives).metrics
+    found = [metrics[name] for name in ("stop_distance", "max_yaw", "max_lateral_position", "max_steer")]
+    np.testing.assert_allclose(found, told, rtol=1e-2)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_run_are_those_of_differences():
+    """On a split road, at three widths: of distance, yaw and place by the driver, the car, a road and a target."""
+    scenario = load("car-split", ["solver.rtol=1e-8", "stop=speed-reached", "stop.speed=3.0"])
+    paths = ("controller.gain", "plant.height", "plant.front_left_tyre.road.c1", "reference.rear_right_slip.slip")
+    names = ("stop_distance", "max_yaw", "max_lateral_position", "max_steer")
+    objectives = {name: scenario.objectives[name] for name in names}
+
+    def run(values):
+        loop = replace(scenario.loop, dict(zip(paths, values, strict=True)))
+        metrics = d.measure(loop, scenario.solver, objectives).metrics
+        return jnp.stack([metrics[name] for name in names])
+
+    x = jnp.array([float(get(scenario.loop, path)) for path in paths])
+    derivative = np.asarray(jax.jit(jax.jacfwd(run))(x))
+    moved = jax.jit(jax.vmap(run))
+    for width, tolerance in ((1e-2, 1e-4), (3e-3, 1e-4), (1e-3, 1e-4)):
+        steps = np.array([-2, -1, 1, 2])[:, None, None] * width * np.diag(x)
+        far, near, close, distant = np.asarray(moved(jnp.asarray((np.asarray(x) + steps).reshape(-1, 4)))).reshape(
+            4, 4, 4
+        )
+        difference = (8 * (close - near) - (distant - far)).T / (12 * width * np.asarray(x))
+        np.testing.assert_allclose(derivative, difference, rtol=tolerance, atol=1e-5 * np.abs(difference).max())

@@ -27,6 +27,7 @@ from diffabs.parts.objectives.tracking import ITAE as ITAE
 from diffabs.parts.objectives.tracking import FinalError as FinalError
 from diffabs.parts.objectives.tracking import MaxSlip as MaxSlip
 from diffabs.parts.objectives.tracking import Overshoot as Overshoot
+from diffabs.parts.objectives.tracking import PeakOutput as PeakOutput
 from diffabs.parts.objectives.tracking import QuadraticCost as QuadraticCost
 from diffabs.parts.objectives.tracking import SettlingTime as SettlingTime
 from diffabs.parts.objectives.tracking import ShareAtLimit as ShareAtLimit

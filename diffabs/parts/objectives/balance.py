@@ -11,7 +11,7 @@ from diffabs.core.numerics import clamp, larger, later_of_larger, sign
 from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import PyTree, Scalar, Vector
-from diffabs.parts.objectives.tracking import FinalValue, HeldValue, Integral
+from diffabs.parts.objectives.tracking import FinalValue, HeldValue, Integral, greatest_magnitude
 
 RATE_NAMES = ("theta_rate", "psi_rate", "phi_rate")
 ANGLE_NAMES = ("theta", "psi", "phi")
@@ -54,23 +54,6 @@ class FinalNorm(FinalValue):
         return _norm(ending.sample.output)
 
 
-def _greatest_angle(name: str) -> tuple[PyTree, PyTree]:
-    """Return start and update of the greatest |angle|, from the cubic of every step."""
-
-    def start(self: object, sample: Sample) -> Memory:
-        del self
-        return Memory(held=jnp.abs(getattr(sample.output, name)))
-
-    def update(self: object, memory: Memory, segment: Segment) -> Scalar:
-        del self
-        angle = segment.output(lambda output: getattr(output, name))
-        # `falls` refers to |angle|, so a negative angle is mirrored.
-        falls = jnp.where(angle.start >= 0, angle.falls, angle.times(-1.0).falls)
-        return later_of_larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()), falls)
-
-    return start, update
-
-
 @pytree
 class PeakLean(HeldValue):
     """Greatest |theta| of the frame [rad]."""
@@ -78,7 +61,7 @@ class PeakLean(HeldValue):
     unit = "rad"
     physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
-    start, update = _greatest_angle("theta")
+    start, update = greatest_magnitude(lambda _: "theta")
 
 
 @pytree
@@ -88,7 +71,7 @@ class PeakArmAngle(HeldValue):
     unit = "rad"
     physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
 
-    start, update = _greatest_angle("psi")
+    start, update = greatest_magnitude(lambda _: "psi")
 
 
 def _greatest_size(size: Callable[[Sample], Scalar]) -> tuple[PyTree, PyTree]:

@@ -20,9 +20,10 @@ from diffabs.core.channels import has_channels
 from diffabs.core.cubic import Cubic
 from diffabs.core.numerics import larger, later_of_larger, sign, smaller
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
-from diffabs.core.pytree import param, parts, pytree
+from diffabs.core.pytree import param, parts, pytree, static
 from diffabs.core.rules import Rule, order_rule
-from diffabs.core.types import Bool, Numbers, Part, PyTree, Scalar, Vector
+from diffabs.core.types import Any, Bool, Numbers, Part, PyTree, Scalar, Vector
+from diffabs.core.units import channel_unit
 
 STEP_EPS = 1000.0  # a shorter step, in eps of the signal, is rounding: a first slip of 0.2 is one of two speeds
 
@@ -140,6 +141,49 @@ class MaxSlip(HeldValue):
         """Return the greatest slip up to the end of the step, from the step's cubic."""
         slip = segment.output(lambda output: output.slip)
         return later_of_larger(memory.held, smaller(slip.greatest(), 1.0), slip.falls)
+
+
+def greatest_magnitude(name_of: Callable[[Any], str]) -> tuple[PyTree, PyTree]:
+    """Return start and update of an objective: the greatest |y| of an output, whose name `name_of(objective)` gives.
+
+    An empty name is that of the first output.
+    """
+
+    def read(objective: object, output: Any) -> Scalar:
+        name = name_of(objective)
+        return getattr(output, name) if name else output[0]
+
+    def start(self: object, sample: Sample) -> Memory:
+        return Memory(held=jnp.abs(read(self, sample.output)))
+
+    def update(self: object, memory: Memory, segment: Segment) -> Scalar:
+        cubic = segment.output(lambda output: read(self, output))
+        # `falls` refers to |y|, so a negative y is mirrored.
+        falls = jnp.where(cubic.start >= 0, cubic.falls, cubic.times(-1.0).falls)
+        return later_of_larger(memory.held, larger(cubic.greatest(), cubic.times(-1.0).greatest()), falls)
+
+    return start, update
+
+
+@pytree
+class PeakOutput(HeldValue):
+    """Greatest magnitude of an output during the run, in its unit.
+
+    >>> from diffabs.parts.objectives import PeakOutput
+    >>> yaw = PeakOutput(output="yaw")
+    """
+
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
+
+    output: str = static(default="")
+    """Name of the output; empty for the first one."""
+
+    start, update = greatest_magnitude(lambda objective: objective.output)
+
+    @property
+    def unit(self) -> str:
+        """Return the unit of the output."""
+        return channel_unit("signal", "", self.output)
 
 
 @pytree

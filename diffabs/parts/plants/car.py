@@ -33,8 +33,8 @@ from diffabs.core.numerics import larger, quotient
 from diffabs.core.protocols import BrakeOutput, Objective, Tyre, TyreForces
 from diffabs.core.pytree import param, part, pytree, static
 from diffabs.core.types import Any, PyTree, Scalar
-from diffabs.parts.controllers import PID, Clamping, NoFeedforward, PerChannel
-from diffabs.parts.objectives import InChannel, LockedTime, StopDistance, StopTime
+from diffabs.parts.controllers import PID, Clamping, HoldCourse, NoFeedforward, PerChannel, SelectLow
+from diffabs.parts.objectives import InChannel, LockedTime, PeakOutput, StopDistance, StopTime
 from diffabs.parts.plants.wheel import GRAVITY, BrakeStart, forward_speed, halt_at_zero, slip_ratio
 from diffabs.parts.references import FilteredSlip, PerTarget
 from diffabs.parts.roads import RoadTyre
@@ -314,23 +314,29 @@ class Car:
         return 0.5 * (self.mass * (u * u + v * v) + self.yaw_inertia * state.yaw_velocity**2 + spins)
 
     def usual_parts(self) -> dict[str, PyTree]:
-        """Return the default parts of a loop: a PID on the slip of each wheel, until standstill, without steering."""
+        """Return the default parts of a loop until standstill: a PID on the slip of each wheel, and a driver.
+
+        Both rear wheels get the lower one of their torques: on a split road they then carry the car to the side.
+        """
         gains = PID(kp=1e4, ki=1.5e5, low=0.0, high=2000.0, antiwindup=Clamping())
+        brakes = SelectLow(controller=PerChannel(dict.fromkeys(BRAKES, gains), BRAKES), groups=(tuple(BRAKES)[2:],))
         return {
             "initial": BrakeStart(),
             "reference": PerTarget(reference=dict.fromkeys(BRAKES.values(), FilteredSlip(slip=0.1))),
             "feedforward": NoFeedforward(),
-            "controller": PerChannel(dict.fromkeys(BRAKES, gains), BRAKES),
+            "controller": HoldCourse(controller=brakes),
             "stop": Standstill(),
         }
 
     def usual_objectives(self) -> dict[str, Objective]:
-        """Return time and distance to the stop, and the time for which each wheel is locked."""
+        """Return time and distance to the stop, the time for which each wheel is locked, and how far the car turns."""
         locked = {
             f"locked_time_{slip.removesuffix('_slip')}": InChannel(objective=LockedTime(), control=brake, output=slip)
             for brake, slip in BRAKES.items()
         }
-        return {"stop_time": StopTime(), "stop_distance": StopDistance(), **locked}
+        signals = {"max_yaw": "yaw", "max_lateral_position": "lateral_position", "max_steer": "steer"}
+        peaks = {metric: PeakOutput(output=name) for metric, name in signals.items()}
+        return {"stop_time": StopTime(), "stop_distance": StopDistance(), **locked, **peaks}
 
     def _load_terms(self) -> tuple[tuple[Scalar, Scalar, Scalar], ...]:
         """Return the load of each wheel at rest [N], and how much X and Y add to it [N/N]."""
