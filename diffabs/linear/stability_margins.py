@@ -37,6 +37,7 @@ NEIGHBOUR_DISTANCE, MAX_GRID_REFINEMENTS = 0.05, 14  # relative distance of neig
 SMALL_LOOP_GAIN, DELAY_TURN_ANGLE = 1e-3, 0.2
 MAX_GRID_FREQUENCIES = 200_000  # points of a grid
 MIN_FREQUENCY, MAX_RANGE_STEPS = 1e-60, 4  # lowest frequency of a grid [rad/s]; steps to crossovers far from the poles
+NEAR_GREATEST = 0.05  # relative distance from the greatest value of a grid, within which a local maximum is refined
 ROOT_BISECTIONS, GOLDEN = 70, (math.sqrt(5) - 1) / 2
 REAL_TOLERANCE = 1e-9  # relative: L(0) and L at half the sampling rate are real but for rounding
 # Longest delay to try with a sampled loop: in periods, and in multiples of the margin without a new sampling. The most
@@ -450,15 +451,25 @@ def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple
 
 
 def find_peak(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple[float, float]:
-    """Return the maximum of a function and its place, by golden-section search around the maximum on a grid."""
+    """Return the maximum of a function and its place, by golden-section search around maxima on a grid.
+
+    Of nearly equal peaks, as a long delay makes, the highest need not have the highest point of the grid.
+    """
     with np.errstate(all="ignore"):
-        i = int(np.nanargmax(function(w)))
-        low, high = w[max(i - 1, 0)], w[min(i + 1, len(w) - 1)]
-        while high - low > 1e-9 * high:
+        values = function(w)
+        values = np.where(np.isnan(values), -math.inf, values)
+        before, after = np.append(-math.inf, values[:-1]), np.append(values[1:], -math.inf)
+        greatest = values.max()
+        high_enough = (
+            values >= greatest - NEAR_GREATEST * abs(greatest) if math.isfinite(greatest) else values == greatest
+        )
+        i = np.flatnonzero((values >= before) & (values >= after) & high_enough)
+        low, high = w[np.maximum(i - 1, 0)], w[np.minimum(i + 1, len(w) - 1)]
+        while np.any(high - low > 1e-9 * high):
             a, b = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-            values = function(np.array([a, b]))
-            low, high = (low, b) if values[0] > values[1] else (a, high)
-        places = np.array([w[i], 0.5 * (low + high)])
+            rises = np.less_equal(*np.split(function(np.concatenate([a, b])), 2))
+            low, high = np.where(rises, a, low), np.where(rises, high, b)
+        places = np.append(w[i], 0.5 * (low + high))
         values = function(places)
     best = int(np.nanargmax(values))
     return float(values[best]), float(places[best])

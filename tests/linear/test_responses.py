@@ -268,6 +268,8 @@ def test_bounds_at_the_points_of_a_box():
         "delay_margin": 5e-3,
         "phase_margin": 0.7,
         "control_noise": 500.0,
+        "pole_decay": 1.0,
+        "pole_damping": 0.1,
     }
     corners = np.array(list(itertools.product(*over.values())))
     points = Batch({path: corners[:, i] for i, path in enumerate(over)})
@@ -277,16 +279,21 @@ def test_bounds_at_the_points_of_a_box():
     for name, source in {"sensitivity": "sensitivity", "delay_margin": "delay", "phase_margin": "phase"}.items():
         system = expected[source].margins
         assert worst[name] == pytest.approx(system.numbers()[source], rel=1e-7)
-    noise, shaped = [], []
+    noise, shaped, poles = [], [], []
     for corner in corners:
         opened = open_loop(replace(loop, dict(zip(over, corner, strict=True))))
         w = np.geomspace(0.1, np.pi / opened.period, 20000)
         s = 1 / (1 + opened.transfer().response(w)[:, 0, 0])
         column = opened.controller.rational_response(w)[:, 0, 1]  # target, slip, speed, ...
         noise.append(np.max(np.abs(s * column)))
+        system = opened.transfer()
+        poles.append(np.log(np.linalg.eigvals(system.A - system.B @ system.C).astype(complex)) / opened.period)
         shaped.append(np.max(np.abs(s) / np.exp(np.interp(np.log(w), *np.log(shape).T))))
     assert worst["control_noise"] == pytest.approx(max(noise), rel=1e-5)
     assert worst["shape"] == pytest.approx(max(shaped), rel=1e-5)
+    modes = np.concatenate(poles)
+    assert worst["pole_decay"] == pytest.approx(np.min(-modes.real), rel=1e-6)
+    assert worst["pole_damping"] == pytest.approx(np.min(-modes.real / abs(modes)), rel=1e-6)
     assert np.max(excess) == pytest.approx(
         max(1 - worst["delay_margin"] / 5e-3, worst["shape"] - 1, max(noise) / 500 - 1)
     )
@@ -295,3 +302,14 @@ def test_bounds_at_the_points_of_a_box():
 def test_bounds_of_one_control_refuse_two():
     with pytest.raises(ValueError, match="delay_margin: of one control; the plant has pump_1, pump_2"):
         FrequencyBounds(delay_margin=1.0).worst(load("quadruple-tank").loop)
+
+
+@killed_by("linear.responses.grid", "return w * (1 - LEAST_GAP * jnp.arange(len(w))[::-1])", "return w")
+def test_a_peak_between_equal_places_around_poles():
+    """1/((s + 1) (s + 2) (s + p)): 5 times the slow pole is 1 times the fast one, so two frequencies would be equal."""
+    for pole, gain, delay in ((5.0, 12.0, 0.2), (10.0, 36.0, 0.4)):
+        a = np.diag([-1.0, -2.0, -pole]) + np.diag(np.ones(2), -1)
+        loop = Transfer(a, np.eye(3, 1), gain * np.eye(3)[2:], np.zeros((1, 1)), None, delay)
+        w = np.geomspace(0.1, 100.0, 20_000)
+        dense = np.max(1 / np.abs(1 + loop.response(w)[:, 0, 0]))
+        assert float(sensitivity_peak(loop).value) == pytest.approx(dense, rel=1e-6)

@@ -28,6 +28,7 @@ LOG_POINTS = 160  # of the first pass
 SPREADS, EVEN_POINTS = 2, 96  # passes that follow, and points of each
 AROUND_POLE = (-5.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 5.0)  # places around a pole, times its decay rate
 PAIR_OFFSET = 0.07  # of these places for the second of a conjugate pair
+LEAST_GAP = 1e-6  # between two frequencies, relative
 MAX_MOVE = 2.0  # largest relative move of L between two points that attracts points
 LOG_SHARE = 1e-3  # of the logarithmic axis in the coordinate of the second pass, for each point
 SMALL_LOOP = 1e-3  # |L| below which its own motion attracts no points
@@ -99,11 +100,12 @@ def first_frequencies(system: TracedSystem, poles: Array) -> Array:
     high = jnp.minimum(high * 10.0**GRID_DECADES, half)
     low = jnp.minimum(low, high) * 10.0**-GRID_DECADES
     even = jnp.geomspace(low, high, LOG_POINTS)
-    # Equal frequencies would look like a local maximum, so the two of a conjugate pair have different places.
     offsets = jnp.array(AROUND_POLE) + jnp.where(poles.imag < 0, PAIR_OFFSET, 0.0)[:, None]
     around = (jnp.abs(poles.imag)[:, None] + jnp.abs(poles.real)[:, None] * offsets).ravel()
     elsewhere = low * (high / low) ** ((jnp.arange(len(around)) + 0.5) / len(around))
-    return jnp.sort(jnp.concatenate([even, jnp.where((around > low) & (around < high), around, elsewhere)]))
+    w = jnp.sort(jnp.concatenate([even, jnp.where((around > low) & (around < high), around, elsewhere)]))
+    # Two equal frequencies, as near equal poles, would hide a maximum beside them: no bracket holds it.
+    return w * (1 - LEAST_GAP * jnp.arange(len(w))[::-1])
 
 
 def spread_evenly(w: Array, *moves: Array) -> Array:
