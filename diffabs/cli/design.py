@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from diffabs.cli import certificates, console, show, show_proofs, targets
-from diffabs.cli.options import read_sides, read_time
+from diffabs.cli.options import read_sides
 from diffabs.core.pytree import parameters
 from diffabs.core.types import JsonObject
-from diffabs.host.values import ScenarioError
+from diffabs.host.values import ScenarioError, read_time
 from diffabs.scenario import proving
 from diffabs.scenario.model import result_document
 from diffabs.scenario.scenario import Scenario

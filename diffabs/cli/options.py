@@ -8,8 +8,6 @@ from diffabs.host.values import ScenarioError, format_given
 from diffabs.scenario.parameter_paths import BoxSide, read_box
 from diffabs.scenario.scenario import Scenario
 
-SECONDS = {"s": 0, "ms": -3, "us": -6}  # powers of ten
-
 
 def read_assignments(texts: Sequence[str], option: str, form: str = "") -> Iterator[tuple[str, str, str]]:
     """Yield name, value and the whole text of each `NAME=VALUE`. The value is empty without `=`.
@@ -37,14 +35,3 @@ def read_sides(options: Sequence[str], scenario: Scenario) -> list[BoxSide]:
         except ValueError:
             raise ScenarioError(f"--over {format_given(text)} is not of the form path=low:high") from None
     return read_box(table, "--over", scenario.loop)
-
-
-def read_time(text: str, option: str) -> float:
-    """Return the time [s] of a text such as `5 ms`; without a unit it is in seconds."""
-    words = text.split()
-    try:
-        power = SECONDS[words[1]] if len(words) == 2 else 0
-        value = read_decimal(words[0])
-        return float(f"{value!r}e{power}") if len(words) <= 2 and "e" not in repr(value) else value * 10.0**power
-    except (IndexError, KeyError, ValueError):
-        raise ScenarioError(f'{option} {format_given(text)}: a time is needed, as in {option} "5 ms"') from None

@@ -8,6 +8,7 @@ import dataclasses
 import datetime
 import difflib
 import json
+import math
 import numbers
 import re
 import reprlib
@@ -21,9 +22,12 @@ from diffabs.core.channels import Channels
 from diffabs.core.pytree import ParameterSpec
 from diffabs.core.renamed import current_name
 from diffabs.core.types import Part, PyTree, Scalar
+from diffabs.host.separated import read_decimal
 
 FINITE_SPEC = ParameterSpec("1")
 POSITIVE_SPEC = ParameterSpec("1", low=0.0, open_low=True)
+SECONDS = {"s": 0, "ms": -3, "us": -6}  # powers of ten
+RADIANS = {"rad": 1.0, "deg": math.pi / 180}
 MIN_LIKENESS = 0.5  # least likeness of two names, of which one is probably a misspelling of the other
 PLAIN_TYPES = (str, bool, int, float, type(None))
 
@@ -129,6 +133,26 @@ def read_whole(value: Scalar, low: int, high: int, path: str) -> int:
     return number
 
 
+def read_time(text: str, path: str) -> float:
+    """Return the time [s] of a text such as `5 ms`; without a unit it is in seconds."""
+    words = text.split()
+    try:
+        power = SECONDS[words[1]] if len(words) == 2 else 0
+        value = read_decimal(words[0])
+        return float(f"{value!r}e{power}") if len(words) <= 2 and "e" not in repr(value) else value * 10.0**power
+    except (IndexError, KeyError, ValueError):
+        raise ScenarioError(f'{path} = {format_given(text)}: a time is needed, as in "5 ms"') from None
+
+
+def read_angle(text: str, path: str) -> float:
+    """Return the angle [rad] of a text such as `40 deg`; without a unit it is in radians."""
+    number, _, unit = text.strip().partition(" ")
+    try:
+        return read_decimal(number) * RADIANS[unit.strip() or "rad"]
+    except (KeyError, ValueError):
+        raise ScenarioError(f'{path} = {format_given(text)}: an angle is needed, as in "40 deg"') from None
+
+
 def whole_reader(low: int, high: int) -> Reader:
     """Return the reader of whole numbers in a range."""
     return lambda value, path: read_whole(value, low, high, path)
@@ -137,6 +161,11 @@ def whole_reader(low: int, high: int) -> Reader:
 def range_reader(spec: ParameterSpec) -> Reader:
     """Return the reader of numbers in a range."""
     return lambda value, path: read_number_in_range(value, spec, path)
+
+
+def text_or_number_reader(read: Callable[[str, str], float], spec: ParameterSpec) -> Reader:
+    """Return the reader of a number in a range, or of a text that `read` turns into one."""
+    return lambda value, path: read_number_in_range(read(value, path) if isinstance(value, str) else value, spec, path)
 
 
 def choice_reader(*names: str) -> Reader:

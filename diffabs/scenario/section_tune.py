@@ -21,7 +21,8 @@
     overshoot = 0.008                                        # at most, on every lane
     [tune.constraints]                                       # of the linear loop, over [design.over]
     sensitivity = 1.7                                        # greatest |S| at most; also complementary, control_noise
-    delay_margin = 5e-3                                      # s at least; also phase_margin, in rad
+    delay_margin = "5 ms"                                    # at least, or 5e-3 [s]; also phase_margin = "40 deg" [rad]
+    pole_decay = 20.0                                        # 1/s at least; also pole_damping, a ratio
     shape = [[10.0, 0.5], [100.0, 1.7]]                      # |S| at most: rows of frequency [rad/s] and value
     samples = 8                                              # points inside the ranges, besides the corners
 
@@ -45,10 +46,13 @@ from diffabs.host.values import (
     list_reader,
     plain_fields,
     range_reader,
+    read_angle,
     read_as_given,
     read_one,
+    read_time,
     table_field,
     table_reader,
+    text_or_number_reader,
     whole_reader,
 )
 from diffabs.host.values import read_table as read_table
@@ -69,6 +73,8 @@ from diffabs.tune import risk
 
 DECLARED_RANGE = "declared"
 MOST_LANES = 100_000
+DELAY_SPEC = ParameterSpec("s", low=0.0, open_low=True)
+PHASE_SPEC = ParameterSpec("rad", 0.0, math.pi, open_low=True)
 
 
 def _aggregate(value: object, path: str) -> JsonObject:
@@ -90,6 +96,8 @@ def _read_shape(value: object, path: str) -> tuple[tuple[float, float], ...]:
     rows = read(value, path)
     if any(len(row) != 2 for row in rows):
         raise ScenarioError(f"{path}: each row is [frequency in rad/s, greatest |S|]")
+    if rows and max(bound for _, bound in rows) < 1:
+        raise ScenarioError(f"{path}: no loop keeps |S| below 1 at all frequencies; a bound of a row is at least 1")
     if any(after[0] <= before[0] for before, after in itertools.pairwise(rows)):
         raise ScenarioError(f"{path}: the frequencies of the rows increase")
     return rows
@@ -104,6 +112,8 @@ class FrequencyConstraints:
         complementary: Greatest |T|.
         delay_margin: Least delay margin [s].
         phase_margin: Least phase margin [rad].
+        pole_decay: Least decay rate of the closed loop's poles [1/s].
+        pole_damping: Least damping ratio of the closed loop's poles, at most 1.
         control_noise: Greatest gain from noise on the tracked signals to the command.
         shape: Rows (frequency [rad/s], greatest |S|).
         samples: Number of points inside the ranges.
@@ -111,8 +121,10 @@ class FrequencyConstraints:
 
     sensitivity: float | None = table_field(range_reader(ParameterSpec("1", low=1.0, open_low=True)), None)
     complementary: float | None = table_field(_positive_reader("1"), None)
-    delay_margin: float | None = table_field(_positive_reader("s"), None)
-    phase_margin: float | None = table_field(range_reader(ParameterSpec("rad", 0.0, math.pi, open_low=True)), None)
+    delay_margin: float | None = table_field(text_or_number_reader(read_time, DELAY_SPEC), None)
+    phase_margin: float | None = table_field(text_or_number_reader(read_angle, PHASE_SPEC), None)
+    pole_decay: float | None = table_field(_positive_reader("1/s"), None)
+    pole_damping: float | None = table_field(range_reader(ParameterSpec("1", 0.0, 1.0, open_low=True)), None)
     control_noise: float | None = table_field(_positive_reader("1"), None)
     shape: tuple[tuple[float, float], ...] = table_field(_read_shape, ())
     samples: int = table_field(whole_reader(0, 1000), 8)

@@ -17,6 +17,7 @@ from diffabs.loop.closed_loop import Loop
 from diffabs.scenario import proving
 from diffabs.scenario.proving import Proved
 from diffabs.scenario.scenario import Scenario
+from diffabs.scenario.section_tune import FrequencyConstraints
 
 if TYPE_CHECKING:
     from diffabs.robust.design.loop_task import ProofTask
@@ -46,7 +47,12 @@ class Work(NamedTuple):
 def build_work(scenario: Scenario) -> Work:
     """Return the runs and constraints of a tuning."""
     from diffabs.tune import AtMost, CertifiedDecay, Poles
+    from diffabs.tune.frequency_bounds import check_one_control
 
+    try:
+        check_one_control(scenario.tune.constraints.bounds(), scenario.loop)
+    except ValueError as error:
+        raise ScenarioError(f"tune.constraints: {error}") from None
     goal = scenario.tune.check(scenario.loop)
     batch = goal.batch(scenario.seed).check(scenario.loop)
     if line := first_refusal(scenario.loop, batch.values, scenario.solver):
@@ -78,6 +84,7 @@ def build_frequency_bounds(scenario: Scenario) -> "FrequencyBounds":
         points=Batch({path: points[:, i] for i, path in enumerate(ranges)}),
     )
     try:
+        _check_reachable(section, loop)
         worst = bounds.worst(loop)
     except ValueError as error:
         raise ScenarioError(f"tune.constraints: {error}") from None
@@ -87,6 +94,21 @@ def build_frequency_bounds(scenario: Scenario) -> "FrequencyBounds":
             "a point of [design.over]; `diffabs margins` says where"
         )
     return bounds
+
+
+def _check_reachable(section: FrequencyConstraints, loop: Loop) -> None:
+    """Raise a ValueError for a bound that no loop of this kind meets, or for poles that a pure delay multiplies."""
+    from diffabs.linear.responses import open_transfer
+
+    if not (section.shape or section.pole_decay or section.pole_damping):
+        return
+    opened = open_transfer(loop)
+    if section.shape and opened.period is None and (end := section.shape[-1][1]) < 1:
+        raise ValueError(f"shape ends at {end:g}, but |S| of a loop in continuous time tends to 1 at high frequencies")
+    if (section.pole_decay or section.pole_damping) and float(opened.delay) > 0:
+        raise ValueError(
+            f"pole_decay and pole_damping are of loops without pure delay; this one has {float(opened.delay):g} s"
+        )
 
 
 def build_tuning(work: Work, engine: str = "auto") -> "Problem":

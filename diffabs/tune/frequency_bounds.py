@@ -1,7 +1,7 @@
 """Bounds on the margins of the linear loop, as constraints of a tuning, at every point of a box."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -23,17 +23,21 @@ from diffabs.linear.responses.opening import join_halves, sampled_delay_margin_o
 from diffabs.linear.responses.response import (
     TracedSystem,
     as_arrays,
+    closed_poles_without_delay,
     largest_singular_values,
     respond,
     respond_sensitivity,
 )
 from diffabs.loop.batch import Batch
 from diffabs.loop.closed_loop import Loop
+from diffabs.tune.constraints import MIN_POLE_MAGNITUDE
 
 MAX_BOUNDED_PEAKS = 3  # highest peaks of a response, each with an excess of its own: their order may change in a search
 LEAST_EXCESS = -1.0  # of a bound that is far from reached, or of a margin without a limit
 AT_MOST = ("sensitivity", "complementary", "control_noise", "shape")
-AT_LEAST = ("delay_margin", "phase_margin")
+AT_LEAST = ("delay_margin", "phase_margin", "pole_decay", "pole_damping")
+OF_ONE_CONTROL = AT_LEAST[:2]
+BOUNDED_POLES = 4  # those that are nearest to a bound, each with an excess
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,6 +56,8 @@ class FrequencyBounds:
         complementary: Largest |T|.
         delay_margin: Least added delay that makes the loop unstable [s].
         phase_margin: Least angle to -1 [rad].
+        pole_decay: Least decay rate of the closed loop's poles [1/s]; of a loop without pure delay.
+        pole_damping: Least damping ratio of the closed loop's poles; of a loop without pure delay.
         control_noise: Largest gain from noise on the tracked signals to the command, in their units.
         shape: Rows (frequency [rad/s], bound of |S|); straight between them on logarithmic axes, constant outside.
         points: The points of the box: values by path of the loop.
@@ -69,6 +75,8 @@ class FrequencyBounds:
     complementary: float | None = None
     delay_margin: float | None = None
     phase_margin: float | None = None
+    pole_decay: float | None = None
+    pole_damping: float | None = None
     control_noise: float | None = None
     shape: tuple[tuple[float, float], ...] = ()
     points: Batch = dataclasses.field(default_factory=Batch)
@@ -101,8 +109,7 @@ class FrequencyBounds:
         Raises:
             ValueError: A bound of one channel for a plant with several controls, or a part has no linear model.
         """
-        if (names := control_names(loop.plant)) and (single := set(self.bounds) & set(AT_LEAST)):
-            raise ValueError(f"{', '.join(sorted(single))}: of one control; the plant has {', '.join(names)}")
+        check_one_control(self.bounds, loop)
         return self.points.each(loop, lambda loop, key: self._evaluate_point(loop))
 
     def _evaluate_point(self, loop: Loop) -> dict[str, Array]:
@@ -115,6 +122,8 @@ class FrequencyBounds:
     def _evaluate_bound(
         self, name: str, loop: Loop, halves: OpenLoop, opened: TracedSystem, grid: FrequencyGrid
     ) -> Array:
+        if name in ("pole_decay", "pole_damping"):
+            return least_of_poles(opened, name)
         if name == "phase_margin":
             return _both(phase_margin_on(opened, grid))
         if name == "delay_margin" and opened.period is None:
@@ -149,6 +158,23 @@ class FrequencyBounds:
             "shape": divide_by_shape,
         }
         return changes[name]
+
+
+def check_one_control(bounds: Iterable[str], loop: Loop) -> None:
+    """Raise a ValueError if a bound is of one control and the plant has several."""
+    if (names := control_names(loop.plant)) and (single := set(bounds) & set(OF_ONE_CONTROL)):
+        raise ValueError(f"{', '.join(sorted(single))}: of one control; the plant has {', '.join(names)}")
+
+
+def least_of_poles(opened: TracedSystem, name: str) -> Array:
+    """Return the least decay rates [1/s] or damping ratios of the closed loop's poles; NaN with a pure delay."""
+    poles = closed_poles_without_delay(opened)
+    if opened.period is not None:
+        # ln 0 and its derivative are infinite, so a pole at z = 0 is replaced before the logarithm.
+        alive = jnp.abs(poles) > MIN_POLE_MAGNITUDE
+        poles = jnp.log(jnp.where(alive, poles, MIN_POLE_MAGNITUDE)) / opened.period
+    values = -poles.real if name == "pole_decay" else -poles.real / jnp.abs(poles)
+    return jnp.where(opened.delay > 0, jnp.nan, -jax.lax.top_k(-values, min(BOUNDED_POLES, len(poles)))[0])
 
 
 def worst_of(values: Mapping[str, Array]) -> dict[str, float]:
