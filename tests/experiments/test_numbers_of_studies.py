@@ -166,6 +166,15 @@ def recovered_by_weights(tables):
     }
 
 
+def gains_of_rules(tables):
+    rules = ("SIMC PI", "AMIGO PI", "AMIGO PID")
+    printed = {}
+    for row in tables["table"]:
+        cells = [f"{row[f'{rule}: {column}']:.2f}" for rule in rules for column in ("ki / best", "peak")]
+        printed[row["family"]] = [str(row["models"]), *cells, f"{row['PID: ki / PI']:.1f}"]
+    return printed
+
+
 @pytest.mark.parametrize(
     ("name", "printed"),
     [
@@ -175,6 +184,7 @@ def recovered_by_weights(tables):
         ("slip_estimator", distances_behind_an_edge),
         ("overshoot_cured", overshoots_at_weak_spots),
         ("pid_over_roads", distances_over_roads),
+        ("pid_published", gains_of_rules),
         ("two_wheeler", recovered_by_two_angles),
         ("two_wheeler", recovered_by_weights),
     ],
