@@ -16,6 +16,7 @@ import typer
 
 from diffabs import __version__
 from diffabs.cli import (
+    assess,
     catalogue,
     compare,
     compile,
@@ -98,6 +99,7 @@ usage.add_command(app, tune.tune, "tune slip-cured --set reference.time_constant
 usage.add_command(app, identify.identify, "identify slip-lmi --data run.csv --free plant.mass=4:8")
 usage.add_command(app, sweep.sweep, "sweep slip-lmi --samples 10000 --set solver.step=1e-3 --figures")
 usage.add_command(app, rare.rare, "rare slip-lmi stop_time=2.2 --set solver.step=1e-3")
+usage.add_command(app, assess.assess_brakes, "assess half-car --load 500", "assess")
 usage.add_command(app, compare.compare, "compare out/sweep-slip-lmi out/sweep-mine --metric iae")
 usage.add_command(app, catalogue.list_parts, "list roads", "list")
 usage.add_command(app, catalogue.show_scenario, "show slip-lmi --set plant.mass=6.2 --out mine.toml", "show")

@@ -36,7 +36,7 @@ def packages():
     rooms = {f"{path.parents[1].name}.{path.parent.name}" for path in inits} - INNER
     return {
         "diffabs",
-        *(f"diffabs.{name}" for name in {"engine.interop", "linear", "linear.responses", "tune", *rooms}),
+        *(f"diffabs.{name}" for name in {"assess", "engine.interop", "linear", "linear.responses", "tune", *rooms}),
     }
 
 

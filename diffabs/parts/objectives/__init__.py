@@ -16,8 +16,10 @@ from diffabs.parts.objectives.balance import RestTime as RestTime
 from diffabs.parts.objectives.balance import SoftLoss as SoftLoss
 from diffabs.parts.objectives.braking import Effort as Effort
 from diffabs.parts.objectives.braking import LockedTime as LockedTime
+from diffabs.parts.objectives.braking import RiseTime as RiseTime
 from diffabs.parts.objectives.braking import StopDistance as StopDistance
 from diffabs.parts.objectives.braking import StopTime as StopTime
+from diffabs.parts.objectives.braking import TimeBetweenSpeeds as TimeBetweenSpeeds
 from diffabs.parts.objectives.braking import TorqueRate as TorqueRate
 from diffabs.parts.objectives.braking import Variation as Variation
 from diffabs.parts.objectives.channels import InChannel as InChannel

@@ -1,6 +1,7 @@
 """Objectives of a braking run: time, distance, locked wheel, effort of the brake."""
 
 import math
+from collections.abc import Callable, Iterator
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -9,7 +10,8 @@ import jax.numpy as jnp
 from diffabs.core.numerics import larger
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import param, pytree
-from diffabs.core.types import Scalar
+from diffabs.core.rules import Rule, order_rule
+from diffabs.core.types import PyTree, Scalar
 from diffabs.parts.objectives.tracking import FinalValue, HeldValue, Integral
 
 
@@ -63,10 +65,83 @@ class LockedTime(HeldValue):
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Return the sum with the part of the step above the threshold [s]."""
-        slip = segment.output(lambda output: output.slip).minus(self.threshold)
-        above, below, root = slip.start > 0, slip.end <= 0, slip.root()
-        part = jnp.where(above, jnp.where(below, root, 1.0), jnp.where(below, 0.0, 1.0 - root))
-        return memory.held + part * segment.h
+        return memory.held + _time_above(segment, lambda output: output.slip, self.threshold)
+
+
+@pytree
+class TimeBetweenSpeeds(HeldValue):
+    """Time [s] that the vehicle takes from the speed `fast` to the speed `slow`."""
+
+    unit = "s"
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
+
+    fast: Scalar = param(default=45 / 3.6, unit="m/s", above=0.0)
+    """Speed at which the time begins."""
+    slow: Scalar = param(default=15 / 3.6, unit="m/s", low=0.0)
+    """Speed at which it ends, < fast."""
+
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
+        """Return the sum with the part of the step between both speeds [s]."""
+        slower, faster = (_time_above(segment, lambda output: output.speed, v) for v in (self.slow, self.fast))
+        return memory.held + slower - faster
+
+    def rules(self) -> Iterator[Rule]:
+        """Yield the rule slow < fast."""
+        yield order_rule(("slow", self.slow), ("fast", self.fast), "m/s", equal=False)
+
+
+class Rise(NamedTuple):
+    """Memory of `RiseTime`.
+
+    Attributes:
+        time: Time since the place [s], up to the rise.
+        risen: 1 once the deceleration has risen, else 0.
+    """
+
+    time: Scalar
+    risen: Scalar
+
+
+@pytree
+class RiseTime(HeldValue):
+    """Time [s] from a place of the road until the deceleration reaches a value; infinite if it does not."""
+
+    unit = "s"
+    unreached: ClassVar[float] = math.inf
+    physical: ClassVar[tuple[float, float]] = (0.0, math.inf)
+
+    place: Scalar = param(default=10.0, unit="m", low=0.0)
+    """Distance at which the time begins."""
+    deceleration: Scalar = param(default=5.0, unit="m/s^2", above=0.0)
+    """Deceleration that ends it."""
+
+    def start(self, sample: Sample) -> Memory:
+        """Return the memory with time 0."""
+        zero = 0.0 * sample.output.deceleration
+        return Memory(held=Rise(zero, zero))
+
+    def update(self, memory: Memory, segment: Segment) -> Rise:
+        """Return the time with the part of the step beyond the place and before the rise [s]."""
+        way = segment.output(lambda output: output.distance).minus(self.place)
+        begin = jnp.where(way.start > 0, 0.0, jnp.where(way.end > 0, way.root(), 1.0))
+        rise = segment.output(lambda output: output.deceleration).minus(self.deceleration)
+        end = jnp.where(rise.start >= 0, 0.0, jnp.where(rise.end >= 0, rise.root(), 1.0))
+        open_ = memory.held.risen < 0.5
+        time = memory.held.time + jnp.where(open_, larger(end - begin, 0.0), 0.0) * segment.h
+        reached = (way.end > 0) & ((rise.end >= 0) | ((rise.start >= 0) & (way.start > 0)))
+        return Rise(time, jnp.where(reached, 1.0, memory.held.risen))
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Return the time, or infinity."""
+        del ending
+        return jnp.where(memory.held.risen > 0.5, memory.held.time, jnp.inf)
+
+
+def _time_above(segment: Segment, read: Callable[[PyTree], Scalar], threshold: Scalar) -> Scalar:
+    """Return the part of a step with `read`(output) above a threshold [s]."""
+    excess = segment.output(read).minus(threshold)
+    above, below, root = excess.start > 0, excess.end <= 0, excess.root()
+    return segment.h * jnp.where(above, jnp.where(below, root, 1.0), jnp.where(below, 0.0, 1.0 - root))
 
 
 @pytree

@@ -177,8 +177,14 @@ class PeakOutput(HeldValue):
 
     output: str = static(default="")
     """Name of the output; empty for the first one."""
+    until: Scalar = param(default=math.inf, unit="s", above=0.0, infinite=True)
+    """Time after which the output does not count."""
 
-    start, update = greatest_magnitude(lambda objective: objective.output)
+    start, within = greatest_magnitude(lambda objective: objective.output)
+
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
+        """Return the greatest magnitude up to the end of the step, from the step's cubic."""
+        return jnp.where(segment.start.t < self.until, self.within(memory, segment), memory.held)
 
     @property
     def unit(self) -> str:

@@ -1,0 +1,222 @@
+"""The clauses of the regulation: the figure of each in the runs, its limit, and the verdict.
+
+    z = 0.849/t        braking rate of the car from 45 to 15 km/h in t seconds (30/3.6/9.81 = 0.849)
+    epsilon = z/k      utilised adhesion; the surfaces give k exactly, where a test house measures it with one axle
+
+Two figures of the split road, z >= 0.75 (4 kL + kH)/5 and z >= kL, stand in no text that was read: they are marked.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.assess.runs import ONE_KMH, Population, RuleStop, TestProgram, plan_stops, run_stops, tyre_fields
+from diffabs.core.types import Array, JsonObject, Scalar
+from diffabs.engine.solvers import Solver
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.result import Run
+from diffabs.parts.plants import GRAVITY
+from diffabs.uncertainty.sweep.statistics.estimates import Count, IntervalEstimate
+
+RATE = 30 * ONE_KMH / GRAVITY  # s, braking rate times the time from 45 to 15 km/h
+SLOWEST = 2.0  # times the shortest time of the longest stop: a slower run does not stop
+PROGRAM_RANGES = {
+    "high": (0.5, 1.5, ""),
+    "low": (0.05, 0.4, ""),
+    "load": (0.0, 1e5, " kg"),
+    "fast": (55.0, 400.0, " km/h"),
+    "steering_ratio": (1.0, 100.0, ""),
+    "brief": (0.0, 10.0, " s"),
+}
+
+
+class Figures(NamedTuple):
+    """The figures of a clause in its stops.
+
+    Attributes:
+        number: Number of the clause in the regulation.
+        rule: What it asks for.
+        values: Figure of each car in each stop, shape (cars, stops).
+        limit: Limit of the figures.
+        unit: Unit of both.
+        at_least: Whether a figure must be at least, or at most the limit.
+        places: Indices of the stops.
+        confirmed: Whether the rule stands in a text that was read.
+    """
+
+    number: str
+    rule: str
+    values: Array
+    limit: Scalar
+    unit: str
+    at_least: bool
+    places: tuple[int, ...]
+    confirmed: bool = True
+
+
+class Clause(NamedTuple):
+    """A clause with its figure in the worst stop of all cars.
+
+    Attributes:
+        number: Number of the clause in the regulation.
+        rule: What it asks for.
+        figure: Figure of the worst stop.
+        limit: Limit of the figure.
+        unit: Unit of both.
+        at_least: Whether the figure must be at least, or at most the limit.
+        stop: The worst stop.
+        confirmed: Whether the rule stands in a text that was read.
+        met: Whether each car meets the clause, shape (cars,); False where a run of the car diverged.
+        diverged: Number of runs that diverged, or did not reach 15 km/h.
+    """
+
+    number: str
+    rule: str
+    figure: float
+    limit: float
+    unit: str
+    at_least: bool
+    stop: str
+    confirmed: bool
+    met: np.ndarray
+    diverged: int
+
+    @property
+    def verdict(self) -> str:
+        """Return "met" or "not met" by all cars; "undecided" if a run diverged and no other one decides."""
+        if np.all(self.met):
+            return "met"
+        within = self.figure >= self.limit if self.at_least else self.figure <= self.limit
+        return "undecided" if within or np.isnan(self.figure) else "not met"
+
+
+class Assessment(NamedTuple):
+    """The verdicts of all clauses.
+
+    Attributes:
+        clauses: The clauses.
+        cars: Number of cars.
+        stops: Number of stops of each.
+        passed: Number of cars that meet all confirmed clauses.
+    """
+
+    clauses: tuple[Clause, ...]
+    cars: int
+    stops: int
+    passed: int
+
+    def probability(self) -> IntervalEstimate:
+        """Return the probability that a car of the distribution meets all confirmed clauses (Clopper and Pearson)."""
+        return Count(self.passed, self.cars).probability()
+
+    def record(self) -> JsonObject:
+        """Return the clauses as JSON values."""
+        rows = [
+            clause._asdict() | {"verdict": clause.verdict, "met": int(np.sum(clause.met))} for clause in self.clauses
+        ]
+        share = self.probability()
+        interval = {"probability": share.value, "interval": [share.low, share.high]} if self.cars > 1 else {}
+        return {"cars": self.cars, "stops": self.stops, "passed": self.passed, **interval, "clauses": rows}
+
+
+def assess(
+    loop: Loop, solver: Solver, program: TestProgram | None = None, population: Population | None = None
+) -> Assessment:
+    """Assess a car, or each car of a population, by the clauses.
+
+    Args:
+        loop: Loop of a `plants.HalfCar` or `plants.Car`. Tyres, stop and initial speed are those of the test.
+        solver: Solver; a duration is extended to twice that of a stop from the high speed at the slippery road's k.
+        program: What the regulation leaves open.
+        population: Parameters of several cars by path, shape (cars,); without one there is one car.
+
+    Raises:
+        ValueError: The plant has no tyres, the population changes them or the speed, or the program is impossible.
+
+    Examples:
+        >>> import diffabs as d
+        >>> from diffabs.assess import assess
+        >>> from diffabs.scenario import load
+        >>> assess(load("slip-lmi").loop, d.Adaptive(1e-5, 20.0))
+        Traceback (most recent call last):
+        ValueError: MirroredRig has no tyres on roads of their own; HalfCar and Car have them
+    """
+    program, population = program or TestProgram(), population or {}
+    check_program(program)
+    prescribed = (*(f"plant.{name}" for name in tyre_fields(loop.plant)), "initial.")
+    if fixed := [path for path in population if path.startswith(prescribed)]:
+        raise ValueError(f"{', '.join(fixed)}: the test prescribes tyres, roads and speeds; draw other parameters")
+    stops = plan_stops(loop.plant, program)
+    duration = max(float(solver.duration), SLOWEST * program.fast * ONE_KMH / (GRAVITY * program.low))
+    runs = run_stops(loop, dataclasses.replace(solver, duration=duration), stops, program, population)
+    failed = (np.asarray(runs.diverged) | ~np.asarray(runs.stopped)).reshape(-1, len(stops))
+    clauses = tuple(_judge(figures, stops, failed) for figures in clause_figures(runs, stops, program))
+    passed = np.all([clause.met for clause in clauses if clause.confirmed], axis=0)
+    return Assessment(clauses, len(failed), len(stops), int(np.sum(passed)))
+
+
+def check_program(program: TestProgram) -> None:
+    """Raise ValueError for coefficients of adhesion, a load, a speed or a time that the rules exclude."""
+    for name, (low, high, unit) in PROGRAM_RANGES.items():
+        if not low <= getattr(program, name) <= high:
+            raise ValueError(f"{name} = {getattr(program, name):g} is outside [{low:g}, {high:g}]{unit}")
+    if program.high < 2 * program.low:
+        raise ValueError(f"high = {program.high:g} is below 2 low = {2 * program.low:g}; clause 5.3.2 needs that ratio")
+
+
+def clause_figures(runs: Run, stops: list[RuleStop], program: TestProgram) -> list[Figures]:
+    """Return the figures of all clauses, differentiable by whatever the `runs` of `run_stops` depend on."""
+    metrics = {name: jnp.reshape(value, (-1, len(stops))) for name, value in runs.metrics.items()}
+    locked = jnp.max(jnp.stack([value for name, value in metrics.items() if name.startswith("locked_")]), axis=0)
+    rate = RATE / metrics["time"]
+    adhesion = jnp.stack([jnp.asarray(program.low if stop.left_side[0] else program.high, float) for stop in stops])
+
+    def row(
+        number: str, rule: str, kind: str, values: Array, limit: Scalar, unit: str, at_least: bool = False
+    ) -> Figures:
+        places = tuple(place for place, stop in enumerate(stops) if stop.kind == kind)
+        return Figures(number, rule, values[:, jnp.asarray(places)], limit, unit, at_least, places)
+
+    rows = [
+        row("5.2.1", "utilised adhesion from 55 km/h", "adhesion", rate / adhesion, 0.75, "1", at_least=True),
+        row("5.3.1", "time locked under full braking", "lock", locked, program.brief, "s"),
+        row("5.3.2", "time locked, good to slippery road", "down", locked, program.brief, "s"),
+        row("5.3.3", "time until the deceleration rises", "up", metrics["rise_time"], 1.0, "s"),
+    ]
+    if "steer" not in metrics:
+        return rows
+    early, whole = (jnp.degrees(program.steering_ratio * metrics[name]) for name in ("early_steer", "steer"))
+    fair = 0.75 * (4 * program.low + program.high) / 5
+    return [
+        *rows,
+        row("5.3.4", "time locked on a split road", "split", locked, program.brief, "s"),
+        row("5.3.7", "steering wheel, first 2 s", "split", early, 120.0, "deg"),
+        row("5.3.7", "steering wheel, in all", "split", whole, 240.0, "deg"),
+        row("", "split: rate, 0.75 (4 kL + kH)/5", "split", rate, fair, "1", at_least=True)._replace(confirmed=False),
+        row("", "split: rate, kL", "split", rate, program.low, "1", at_least=True)._replace(confirmed=False),
+    ]
+
+
+def _judge(figures: Figures, stops: list[RuleStop], failed: np.ndarray) -> Clause:
+    """Return a clause with its worst stop, and whether each car meets it."""
+    values, missed = np.asarray(figures.values), failed[:, list(figures.places)]
+    finished = np.where(missed, np.nan, values)
+    worst = np.full_like(finished, np.inf if figures.at_least else -np.inf)
+    worst = np.where(np.isnan(finished), worst, finished)
+    _, column = np.unravel_index(np.argmin(worst) if figures.at_least else np.argmax(worst), worst.shape)
+    figure = float(np.min(worst) if figures.at_least else np.max(worst))
+    within = finished >= figures.limit if figures.at_least else finished <= figures.limit  # False for NaN
+    return Clause(
+        figures.number,
+        figures.rule,
+        np.nan if np.all(np.isnan(finished)) else figure,
+        float(figures.limit),
+        figures.unit,
+        figures.at_least,
+        stops[figures.places[column]].describe(),
+        figures.confirmed,
+        np.all(within, axis=1),
+        int(np.sum(missed)),
+    )

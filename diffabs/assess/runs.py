@@ -1,0 +1,148 @@
+"""The stops that the clauses ask for, as one batch: each has a speed, a load, and two surfaces for each side.
+
+All wheels of a stop have the same two surfaces, one before and one behind an edge; on a split road those of the right
+side differ. Every run ends at 15 km/h, below which a wheel may lock.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.assess.surfaces import make_surface
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import get, replace
+from diffabs.core.types import AnyArray, Array, Part, Scalar
+from diffabs.engine.solvers import Solver
+from diffabs.loop.batch import Batch
+from diffabs.loop.closed_loop import Loop
+from diffabs.loop.ensemble import run_batch
+from diffabs.loop.result import Run
+from diffabs.parts.objectives import InChannel, LockedTime, PeakOutput, RiseTime, TimeBetweenSpeeds
+from diffabs.parts.plants import GRAVITY
+from diffabs.parts.roads import Patches, RoadTyre
+from diffabs.parts.stops import SpeedReached
+
+ONE_KMH = 1 / 3.6  # m/s
+NO_EDGE = 1e6  # m, beyond the end of every run
+UP_EDGE = 0.5 * ONE_KMH * 50.0  # m, half a second at 50 km/h
+CURVE = ("c1", "c2", "c3", "c4")
+SOON = 2.0  # s, the time of the first limit of the steering
+HIGH, LOW = (False, False), (True, True)
+Population = Mapping[str, AnyArray]  # parameters of several cars by path, shape (cars,)
+
+
+class TestProgram(NamedTuple):
+    """What the regulation leaves to the test house.
+
+    Attributes:
+        high: Coefficient of adhesion of the good road [1], about 0.8.
+        low: That of the slippery road [1], at most 0.3.
+        load: Mass that a laden car carries [kg], at its centre of gravity.
+        fast: The high speed [km/h].
+        steering_ratio: Angle of the steering wheel per steer angle [1].
+        brief: Longest time for which a wheel may lock above 15 km/h [s]. The regulation allows brief locking without a
+            number; this one is ours.
+    """
+
+    high: Scalar = 0.8
+    low: Scalar = 0.3
+    load: Scalar = 400.0
+    fast: Scalar = 120.0
+    steering_ratio: Scalar = 16.0
+    brief: Scalar = 0.1
+
+
+class RuleStop(NamedTuple):
+    """One stop.
+
+    Attributes:
+        kind: "adhesion", "lock", "down", "up" or "split".
+        speed: Speed at its start [km/h].
+        laden: Whether the car carries the load.
+        left_side: The surfaces of the left wheels before and behind the edge: True for the slippery one.
+        right_side: Those of the right wheels.
+        edge: Distance of the edge [m].
+    """
+
+    kind: str
+    speed: float
+    laden: bool
+    left_side: tuple[bool, bool]
+    right_side: tuple[bool, bool]
+    edge: float
+
+    def describe(self) -> str:
+        """Return surfaces, speed and load in words."""
+        sides = [" to ".join(dict.fromkeys("low" if slippery else "high" for slippery in side)) for side in self[3:5]]
+        return f"{' | '.join(dict.fromkeys(sides))}, {self.speed:g} km/h, {'laden' if self.laden else 'unladen'}"
+
+
+def tyre_fields(plant: Part) -> tuple[str, ...]:
+    """Return the names of a plant's tyres. Raises ValueError for a plant without any."""
+    names = tuple(name for name in vars(plant) if name.endswith("_tyre"))
+    if not names:
+        raise ValueError(f"{type(plant).__name__} has no tyres on roads of their own; HalfCar and Car have them")
+    return names
+
+
+def plan_stops(plant: Part, program: TestProgram) -> list[RuleStop]:
+    """Return the stops of the clauses: unladen, then laden. A split road needs a car with two sides."""
+    split = any("left" in name for name in tyre_fields(plant))
+    return [stop for laden in (False, True) for stop in _plan_load(laden, float(program.fast), split)]
+
+
+def run_stops(
+    loop: Loop, solver: Solver, stops: list[RuleStop], program: TestProgram, population: Population | None = None
+) -> Run:
+    """Return the runs of all stops with their metrics, shape (cars, stops) or (stops,). Also for a traced loop."""
+    population, columns, plant = population or {}, {}, loop.plant
+    cars = next((len(column) for column in population.values()), 1)
+    curves = make_surface(program.high, slippery=False), make_surface(program.low, slippery=True)
+    for name in tyre_fields(plant):
+        plant = replace(plant, {name: RoadTyre(road=Patches(roads=(curves[0], curves[0]), edges=np.array([NO_EDGE])))})
+        sides = [stop.right_side if "right" in name else stop.left_side for stop in stops]
+        for place in (0, 1):
+            for coefficient in CURVE:
+                values = _stack(getattr(curves[side[place]], coefficient) for side in sides)
+                columns[f"plant.{name}.road.roads.{place}.{coefficient}"] = jnp.tile(values, cars)
+        columns[f"plant.{name}.road.edges"] = jnp.tile(_stack(stop.edge for stop in stops), cars)[:, None]
+    columns["initial.speed"] = jnp.tile(ONE_KMH * _stack(stop.speed for stop in stops), cars)
+    columns |= {path: jnp.repeat(jnp.asarray(column), len(stops)) for path, column in population.items()}
+    empty = columns.get("plant.mass", get(loop, "plant.mass"))
+    columns["plant.mass"] = empty + jnp.tile(program.load * _stack(stop.laden for stop in stops), cars)
+    ready = replace(loop, {"plant": plant, "stop": SpeedReached(speed=15 * ONE_KMH)})
+    return run_batch(ready, Batch(columns), solver, _objectives(loop.plant, program))
+
+
+def _plan_load(laden: bool, fast: float, split: bool) -> Iterator[RuleStop]:
+    """Yield the stops of a laden or an unladen car."""
+    for road in (HIGH, LOW):
+        yield RuleStop("adhesion", 55.0, laden, road, road, NO_EDGE)
+        for speed in (40.0, fast):
+            yield RuleStop("lock", speed, laden, road, road, NO_EDGE)
+    for speed in (40.0, fast):
+        yield RuleStop("down", speed, laden, (False, True), (False, True), 0.5 * ONE_KMH * speed)
+    yield RuleStop("up", 50.0, laden, (True, False), (True, False), UP_EDGE)
+    if split:
+        yield RuleStop("split", 50.0, laden, HIGH, LOW, NO_EDGE)
+
+
+def _objectives(plant: Part, program: TestProgram) -> dict[str, Objective]:
+    """Return the objectives of every stop."""
+    locked: dict[str, Objective] = {
+        f"locked_{slip}": InChannel(objective=LockedTime(), control=f"{slip.removesuffix('_slip')}_brake", output=slip)
+        for slip in plant.shows.tracked
+    }
+    steered = {"steer": PeakOutput(output="steer"), "early_steer": PeakOutput(output="steer", until=SOON)}
+    return {
+        "time": TimeBetweenSpeeds(fast=45 * ONE_KMH, slow=15 * ONE_KMH),
+        "rise_time": RiseTime(place=UP_EDGE, deceleration=0.75 * program.high * GRAVITY),
+        **locked,
+        **(steered if "steer" in plant.shows._fields else {}),
+    }
+
+
+def _stack(values: Iterator[Scalar]) -> Array:
+    return jnp.stack([jnp.asarray(value, float) for value in values])
