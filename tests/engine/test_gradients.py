@@ -213,6 +213,19 @@ LOOPS = {
             blocks=(actuators.Lag(time_constant=0.004), actuators.IntegratingValve(gain=2100.0, low=3.0, high=130.0))
         ),
     ),
+    "thresholds": braking(
+        plant=plants.QuarterCar(mass=300.0, radius=0.3, inertia=1.0, road=roads.MagicFormula()),
+        initial=d.BrakeStart(speed=8.0, slip=0.02),
+        stop=SpeedReached(speed=6.0),
+        sensor=sensors.SelectHigh(slope=8.0),
+        controller=controllers.FivePhase(period=5e-3),
+        actuator=blocks.Series(
+            blocks=(
+                actuators.DeadTime(rise=0.0033, fall=0.0022),
+                actuators.HydraulicBrake(inlet_time=0.13, outlet_time=0.06, laminar_pressure=1e5),
+            )
+        ),
+    ),
     "cascade": braking(
         **CAR,
         controller=controllers.Cascade(
@@ -244,6 +257,7 @@ LOOPS |= {
             sensor={
                 "level_1": actuators.Lag(time_constant=1.5),
                 "level_2": sensors.OutputNoise(deviation=1e-4, period=0.5),
+                "level_3": sensors.OutputError(factor=1.02, offset=1e-3),
             }
         ),
         actuator=actuators.PerControl(actuator={"pump_1": actuators.Lag(time_constant=0.8)}),
@@ -323,6 +337,7 @@ SLOW = (
         "four phases",
         "band",
         "valve",
+        "thresholds",
         "given commands",
     ),
     *("two inputs", "two inputs, lowest", "two inputs, observed"),

@@ -124,6 +124,9 @@ CONTROLLERS: dict[str, Any] = {
     "played command": controllers.PlayedCommand(commands=np.array([0.0, 30.0, 12.0]), period=2e-3),
     "sampled relay": controllers.Sampled(controller=controllers.Relay(), delay=3e-4),
     "sampled on the grid": controllers.SampledOnGrid(controller=_PID, sampling_period=2e-3, delay=1.3e-3),
+    "five phase": controllers.FivePhase(
+        braking_threshold=300.0, strong_threshold=400.0, slip_low=0.12, slip_high=0.19, opening=0.2, period=1e-3
+    ),
     "four phase": controllers.FourPhase(torque_low=10.0, torque_high=20.0, slip_low=0.11, slip_high=0.15, rate=6000.0),
     "band logic": controllers.BandLogic(slip_low=0.12, slip_high=0.17, growth=20.0, decay=30.0, torque=30.0, high=35.0),
 }
@@ -148,6 +151,7 @@ ACTUATORS: dict[str, Any] = {
     "lag": actuators.Lag(),
     "asymmetric lag": actuators.AsymmetricLag(rise=0.012, fall=0.004),
     "dead time": actuators.DeadTime(rise=2.3e-3, fall=1.6e-3),
+    "hydraulic brake": actuators.HydraulicBrake(inlet_time=0.03, dead_share=0.01, laminar_pressure=3e5),
     "integrating valve": actuators.IntegratingValve(gain=200.0, low=-5.0, high=20.0),
     "rate limit": actuators.RateLimit(),
     "delay": actuators.Delay(time=2.3e-3, capacity=8),
@@ -169,6 +173,7 @@ SENSORS: dict[str, Any] = {
     "played wheel noise": sensors.PlayedWheelNoise(noise=np.array([0.01, -0.02, 0.005]), period=2e-3),
     "drifting speed": sensors.DriftingSpeed(first=0.03, last=-0.05, time_constant=0.01),
     "encoder slip": sensors.EncoderSlip(period=2e-3),
+    "select high": sensors.SelectHigh(slope=12.0, period=2e-3),
     "estimated speed": sensors.SpeedEstimator(gate=0.2, growth=0.3, period=2e-3),
     "series": blocks.Series(blocks=(sensors.Noise(deceleration=0.05), sensors.WheelSpeed())),
 }
@@ -258,7 +263,8 @@ WITH_CHANNELS: dict[str, dict[str, Any]] = {
     "sensor": {
         "per output": sensors.PerOutput(
             sensor={"level_1": actuators.Lag(time_constant=2.0), "level_2": sensors.OutputNoise(deviation=1e-3)}
-        )
+        ),
+        "per output, errors": sensors.PerOutput(sensor={"level_1": sensors.OutputError(factor=1.01, offset=1e-3)}),
     },
     "objective": {
         "in a channel": objectives.InChannel(objective=objectives.IAE(), output="level_2", control="pump_2"),

@@ -2,6 +2,7 @@
 
 from diffabs.parts.actuators.dead_time import DeadTime as DeadTime
 from diffabs.parts.actuators.delay import Delay as Delay
+from diffabs.parts.actuators.hydraulics import HydraulicBrake as HydraulicBrake
 from diffabs.parts.actuators.lag import AsymmetricLag as AsymmetricLag
 from diffabs.parts.actuators.lag import Lag as Lag
 from diffabs.parts.actuators.lag import Limits as Limits

@@ -24,5 +24,6 @@ from diffabs.parts.controllers.sampled_on_grid import SampledOnGrid as SampledOn
 from diffabs.parts.controllers.switching import ConstantTorque as ConstantTorque
 from diffabs.parts.controllers.switching import Relay as Relay
 from diffabs.parts.controllers.switching import SlidingMode as SlidingMode
+from diffabs.parts.controllers.threshold_logic import FivePhase as FivePhase
 from diffabs.parts.controllers.torque_logic import BandLogic as BandLogic
 from diffabs.parts.controllers.torque_logic import FourPhase as FourPhase

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from diffabs.core.blocks import Parallel
 from diffabs.core.channels import select_output
-from diffabs.core.protocols import Block, Clock, Memory, no_flow
+from diffabs.core.protocols import Block, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import param, part, pytree
 from diffabs.core.rules import period_on_grid
 from diffabs.core.types import PyTree, Scalar
@@ -18,9 +18,9 @@ from diffabs.parts.sensors.noise import draw_noise
 class PerOutput(Parallel):
     """A sensor for each of several outputs, by the output's name; other outputs pass unchanged.
 
-    A sensor of one output maps a number to a number, as do `OutputNoise` and the actuators `Lag`, `Delay`, `DeadTime`
-    and `Limits`. If the plant's output type has a method `channel`, a sensor instead sees the outputs of its channel:
-    the slip and the speeds of a wheel.
+    A sensor of one output maps a number to a number, as do `OutputError`, `OutputNoise` and the actuators `Lag`,
+    `Delay`, `DeadTime` and `Limits`. If the plant's output type has a method `channel`, the sensor of a tracked output
+    instead sees the outputs of its channel: the slip and the speeds of a wheel.
 
     >>> from diffabs.parts.actuators import Lag
     >>> from diffabs.parts.sensors import OutputNoise, PerOutput
@@ -37,14 +37,14 @@ class PerOutput(Parallel):
     def select(self, name: str, signal: PyTree) -> PyTree:
         """Return the output, or the outputs of its channel."""
         output = select_output(signal, name)
-        return output if hasattr(signal, "channel") else output[0]
+        return output if _has_channel(signal, name) else output[0]
 
     def join(self, signal: PyTree, outputs: dict[str, PyTree]) -> PyTree:
         """Return all measured outputs."""
-        if not hasattr(signal, "with_channel"):
-            return signal._replace(**outputs)
         for name, output in outputs.items():
-            signal = signal.with_channel(name, output)
+            signal = (
+                signal.with_channel(name, output) if _has_channel(signal, name) else signal._replace(**{name: output})
+            )
         return signal
 
     def units_inside(self, name: str, units: Units) -> Units:
@@ -55,6 +55,29 @@ class PerOutput(Parallel):
         """Yield a line if there is no sensor."""
         if not self.sensor:
             yield 'sensor = {} is empty; a sensor by output is needed, such as {"level_1": OutputNoise()}'
+
+
+def _has_channel(signal: PyTree, name: str) -> bool:
+    """Return whether an output is that of a channel with outputs of its own."""
+    return hasattr(signal, "channel") and name in type(signal).tracked
+
+
+@pytree
+class OutputError:
+    """factor * signal + offset: the error of one measured output, such as a wheel's radius or an accelerometer's zero."""
+
+    factor: Scalar = param(default=1.0, unit="1", above=0.0)
+    """Ratio of the shown output to the true one."""
+    offset: Scalar = param(default=0.0, unit="signal")
+    """Number added to the output."""
+
+    start = no_memory
+    flow = no_flow
+
+    def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """Return the output with its errors."""
+        del t, memory
+        return self.factor * signal + self.offset
 
 
 @pytree

@@ -10,6 +10,9 @@ Every period h, from the measured deceleration a and wheel speed w:
     v = p + L (w - p),           P = (1 - L) P-
     f = max(a, f exp(-h/hold))                            recent deceleration: rises at once, decays slowly
 
+With several wheels, each one has its s, open and L, and corrects v and P in turn; the filter starts, and starts again,
+from the fastest one.
+
 The filter starts from v = w, P = R and f = g. It restarts where s >= gate and f < rest. While the wheel still rolls, it
 averages the first samples (L = 1/2, 1/3, ...). Once the wheel is braked or locked, the filter uses the accelerometer
 alone and P grows. The larger P is, the sooner the filter trusts a rolling wheel again. The filter always trusts a wheel
@@ -41,10 +44,11 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp, larger
-from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
+from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import period_on_grid
-from diffabs.core.types import Scalar
+from diffabs.core.types import PyTree, Scalar
+from diffabs.parts.sensors.reference_speed import fastest_rim, rim_speeds, show_speed
 
 BRAKED = 9.81  # m/s^2, recent deceleration f that the filter assumes at its start
 
@@ -67,7 +71,7 @@ class EstimatorMemory(NamedTuple):
 
 @pytree
 class SpeedEstimator:
-    """A gated Kalman filter of the vehicle speed from wheel speed and accelerometer for a wheel that may slip."""
+    """A gated Kalman filter of the vehicle speed from accelerometer and wheels that may slip, one or several."""
 
     noise: Scalar = param(default=0.005, unit="1", above=0.0)
     """Relative noise of the wheel speed."""
@@ -87,33 +91,35 @@ class SpeedEstimator:
     flow = no_flow
     grid_rules = period_on_grid
 
-    def start(self, signal: BrakeOutput) -> Memory:
+    def start(self, signal: PyTree) -> Memory:
         """Return the memory with v = w, at least `floor`, P = (noise v)^2 and f = 9.81 m/s^2."""
-        w = jnp.maximum(signal.wheel_speed, self.floor)
+        w = jnp.maximum(fastest_rim(signal), self.floor)
         return Memory(held=EstimatorMemory(w, (self.noise * w) ** 2, BRAKED + 0.0 * w, 0.0 * w))
 
-    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Return the signal with the estimated speed v, and the slip (v - w)/v computed with it."""
+    def output(self, t: Scalar, memory: Memory, signal: PyTree) -> PyTree:
+        """Return the signal with the estimated speed v, and the slips (v - w)/v computed with it."""
         del t
-        v = memory.held.speed
-        return signal._replace(slip=(v - signal.wheel_speed) / v, speed=v)
+        return show_speed(signal, memory.held.speed)
 
-    def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
+    def tick(self, clock: Clock, memory: Memory, signal: PyTree) -> Memory:
         """Return the memory after one filter step if a period begins, else the old memory.
 
-        At the first sample, and where slip >= gate with f < rest, the filter starts again from the wheel speed.
+        At the first sample, and where the least slip >= gate with f < rest, the filter starts again.
         """
         now, _ = clock.ticks(self.period)
         m: EstimatorMemory = memory.held
         first = self.start(signal).held
         predicted = jnp.maximum(m.speed - self.period * signal.deceleration, self.floor)
         variance = m.variance + self.period * self.growth**2
-        slip = (predicted - signal.wheel_speed) / predicted
         braked = larger(signal.deceleration, m.braked * jnp.exp(-self.period / self.hold))
-        open_ = clamp(1 - slip / self.gate, 0.0, 1.0)
-        gain = open_ * variance / (variance + (self.noise * predicted) ** 2)
-        v = jnp.maximum(predicted + gain * (signal.wheel_speed - predicted), self.floor)
-        later = EstimatorMemory(v, (1 - gain) * variance, braked, jnp.ones_like(v))
+        v = predicted
+        for w in rim_speeds(signal):
+            slip = (predicted - w) / predicted
+            open_ = clamp(1 - slip / self.gate, 0.0, 1.0)
+            gain = open_ * variance / (variance + (self.noise * predicted) ** 2)
+            v, variance = v + gain * (w - v), (1 - gain) * variance
+        later = EstimatorMemory(jnp.maximum(v, self.floor), variance, braked, jnp.ones_like(v))
+        slip = (predicted - fastest_rim(signal)) / predicted
         goes_on = (m.begun > 0.5) & ((slip < self.gate) | (braked >= self.rest))
         new = jax.tree.map(lambda a, b: jnp.where(goes_on, a, b), later, first._replace(begun=1.0 + 0.0 * v))
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m))
