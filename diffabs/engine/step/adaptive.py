@@ -354,7 +354,7 @@ class AdaptiveStepping:
 
     def _guard_mode(self, judged: Judged, after: Carry) -> tuple[Carry, CrossingCount, ModeGuard]:
         """Return the carry `after` an attempt with its lost slide, its crossings, and what becomes of its mode."""
-        _, carry, attempt, decision = judged
+        system, carry, attempt, decision = judged
         control, report, accepted = carry.control, attempt.report, decision.accepted
         count = CrossingCount(control.consecutive_crossings, control.stability_fraction, False)
         if self.switches.keeps_mode:
@@ -364,6 +364,8 @@ class AdaptiveStepping:
             count = count._replace(falls_short=self._jumps_at_end(carry, report, decision))
         if watch := after.slides:
             score = jnp.maximum(count.crossings + jnp.where(report.returns >= 0, RETURN_SCORE, -1), 0)
+            if system.hybrid.ticks:  # each tick may move a sampled signal across a surface, to which the flow returns
+                score = jnp.where(after.since > 0, score, 0)
             count = count._replace(crossings=jnp.where(accepted, score, count.crossings))
             slide = begin_slide(watch.lost, count.crossings >= MAX_RETURN_SCORE, report.returns, after.point.t)
             after = after._replace(slides=watch._replace(lost=slide))

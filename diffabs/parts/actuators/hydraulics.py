@@ -21,7 +21,7 @@ so the pads do not heat up, and their friction is constant.
 
 Source: J. C. Gerdes and J. K. Hedrick, Brake System Modeling, Control and Integrated Brake/Throttle Switching: Phase I,
 UCB-ITS-PRR-97-21, 1997, for the flow proportional to the root of the pressure difference, the pressure as a function of
-the volume, and the push-out pressure. The default numbers are those of no particular brake: it reaches 100 bar in 0.2 s.
+the volume, and the push-out pressure. The default numbers are of no particular brake, which reaches 100 bar in 0.2 s.
 """
 
 import jax.numpy as jnp

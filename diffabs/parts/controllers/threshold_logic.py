@@ -39,7 +39,7 @@ import jax.numpy as jnp
 from diffabs.core.protocols import Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import Rule, order_rule, period_on_grid
-from diffabs.core.types import Bool, Scalar
+from diffabs.core.types import PyTree, Scalar
 
 
 class BrakePhase(IntEnum):
@@ -133,15 +133,15 @@ class FivePhase:
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rules recovery_threshold < strong_threshold and slip_low < slip_high."""
-        accelerations = [(name, getattr(self, name)) for name in ("recovery_threshold", "strong_threshold")]
-        yield order_rule(*accelerations, "m/s^2", equal=False)
+        recovery, strong = ("recovery_threshold", self.recovery_threshold), ("strong_threshold", self.strong_threshold)
+        yield order_rule(recovery, strong, "m/s^2", equal=False)
         yield order_rule(("slip_low", self.slip_low), ("slip_high", self.slip_high), "1", equal=False)
 
     def _follow_phase(self, phase: Scalar, acceleration: Scalar, slip: Scalar) -> Scalar:
         """Return the phase after a tick."""
         brakes, recovers = acceleration < -self.braking_threshold, acceleration > self.recovery_threshold
         locks = slip > self.slip_high
-        ways: dict[BrakePhase, list[tuple[BrakePhase, Bool]]] = {
+        ways: dict[BrakePhase, list[tuple[BrakePhase, PyTree]]] = {
             BrakePhase.BUILD: [(BrakePhase.HOLD, brakes)],
             BrakePhase.HOLD: [(BrakePhase.DUMP, slip > self.slip_low), (BrakePhase.SLOW_BUILD, ~brakes)],
             BrakePhase.DUMP: [(BrakePhase.RECOVER, recovers), (BrakePhase.WAIT, ~brakes & ~locks)],

@@ -64,7 +64,7 @@ def _has_channel(signal: PyTree, name: str) -> bool:
 
 @pytree
 class OutputError:
-    """factor * signal + offset: the error of one measured output, such as a wheel's radius or an accelerometer's zero."""
+    """factor * signal + offset: an error of one measured output, of a wheel's radius or an accelerometer's zero."""
 
     factor: Scalar = param(default=1.0, unit="1", above=0.0)
     """Ratio of the shown output to the true one."""
