@@ -8,11 +8,11 @@ from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, plants, references, roads, stops
-from diffabs.core.blocks import Series
+from diffabs.core.blocks import Direct, Series
 from diffabs.core.protocols import BrakeOutput, Clock
 from diffabs.parts.objectives import StopDistance
 from diffabs.parts.plants.car import CarOutput
-from diffabs.parts.plants.half_car import HalfCarOutput
+from diffabs.parts.plants.half_car import CHANNELS, HalfCarOutput
 from diffabs.parts.sensors import OutputError, OutputNoise, PerOutput, SelectHigh, SpeedEstimator, SpeedScale
 
 PERIOD, COUNT = 1e-3, 600
@@ -139,3 +139,48 @@ def test_a_clock_that_moves_the_slip_across_its_target_is_no_slide():
     runs = [d.measure(loop, solver, {"distance": StopDistance()}) for solver in (d.Adaptive(1e-6, 10.0), FIXED)]
     assert not any(run.diverged for run in runs)
     np.testing.assert_allclose(runs[0].metrics["distance"], runs[1].metrics["distance"], rtol=1e-5)
+
+
+def of_half_car(sensor, gains=None):
+    """Return the loop of the page's table: a PID for each axle, to 4 m/s."""
+    car = plants.HalfCar()
+    usual = car.usual_parts()
+    pid = controllers.PID(kp=2e4, ki=3e5, low=0.0, high=4000.0, antiwindup=controllers.BackCalculation())
+    pids = {brake: d.replace(pid, gains or {}) for brake in CHANNELS}
+    parts = {"sensor": sensor, "controller": controllers.PerChannel(pids, CHANNELS)}
+    return d.Loop(plant=car, **usual | parts | {"stop": stops.SpeedReached(speed=4.0)})
+
+
+def with_offset(offset, **numbers):
+    """Return the filter behind an accelerometer with an offset [m/s^2]."""
+    return Series(
+        blocks=(PerOutput(sensor={"deceleration": OutputError(offset=offset)}), SpeedEstimator(**numbers)),
+    )
+
+
+TUNED = {"gate": 0.001, "growth": 0.017, "noise": 0.0078}
+ON_PAGE = {
+    "true": (Direct(), {}, [38.3, 0.0, 52.4, 0.0]),
+    "select high": (SelectHigh(), {}, [38.0, 0.14, 68.6, 8.96]),
+    "filter": (with_offset(0.0, gate=0.01), {}, [37.8, 0.26, 52.2, 0.26]),
+    "tuned": (with_offset(0.0, **TUNED), {"kp": 4e4, "ki": 6e5}, [37.6, 0.01, 52.0, 0.01]),
+    "offset": (with_offset(0.2, **TUNED), {"kp": 4e4, "ki": 6e5}, [37.2, 1.04]),
+    "offset, negative": (with_offset(-0.2, **TUNED), {"kp": 4e4, "ki": 6e5}, [39.9, 0.0]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", ON_PAGE)
+def test_the_table_of_the_page(row):
+    """Distance and overshoot of the front axle on dry and on wet asphalt, as docs/car.md has them."""
+    sensor, gains, expected = ON_PAGE[row]
+    loop, solver = of_half_car(sensor, gains), d.Adaptive(rtol=1e-6, duration=10.0)
+    wet = {f"plant.{axle}_tyre.road.{name}": getattr(roads.WET_ASPHALT, name)
+           for axle in ("front", "rear") for name in ("c1", "c2", "c3")}  # fmt: skip
+    usual = loop.plant.usual_objectives()
+    measured = {name: usual[name] for name in ("stop_distance", "overshoot_front")}
+    for values, numbers in (({}, expected[:2]), (wet, expected[2:])):
+        if numbers:
+            metrics = d.measure(d.replace(loop, values), solver, measured).metrics
+            np.testing.assert_allclose([float(metrics[name]) for name in measured], numbers, rtol=0, atol=0.06)
+            assert abs(float(metrics["overshoot_front"]) - numbers[1]) < 0.006
