@@ -44,6 +44,7 @@ def test_an_override_changes_one_channel():
     assert loop.controller.controller["pump_2"].kp == 3893.0
 
 
+@pytest.mark.slow
 def test_tune_and_sweep(tmp_path):
     tuned = tmp_path / "tuned.toml"
     fast = ("--set", "solver.duration=60", "--set", "tune.iterations=2", "--set", "sweep.samples=16")

@@ -178,7 +178,7 @@ def in_channel(control, output):
 
 
 @killed_by("core.channels", "order = (name, *", "order = (*", case="fixed")
-@pytest.mark.parametrize("how", SOLVERS)
+@pytest.mark.parametrize("how", cases(SOLVERS, "adaptive"))
 def test_channels_that_do_not_meet_are_two_loops(how):
     """Fixed steps to rounding. Adaptive steps are those of both channels, so the values differ within the tolerance."""
     tolerance = {"fixed": 1e-13, "adaptive": 2e-6}[how]
@@ -189,6 +189,7 @@ def test_channels_that_do_not_meet_are_two_loops(how):
             np.testing.assert_allclose(both[name], value, rtol=tolerance, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_sampled_channels_with_delays_are_two_loops():
     def sampled(inner):
         return controllers.Sampled(controller=inner, period=0.1, delay=0.03)
@@ -203,6 +204,7 @@ def test_sampled_channels_with_delays_are_two_loops():
             np.testing.assert_allclose(both[name], value, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_controllers_with_own_clocks_and_relays_are_two_loops():
     each = {
         "left": controllers.Sampled(controller=PIDS["left"], period=0.06, delay=0.05),
@@ -216,6 +218,7 @@ def test_controllers_with_own_clocks_and_relays_are_two_loops():
             np.testing.assert_allclose(both[name], value, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_one_controller_for_all_has_a_memory_for_each():
     shared = controllers.PerChannel(PIDS["right"], CHANNELS)
     each = controllers.PerChannel({"left": PIDS["right"], "right": PIDS["right"]}, CHANNELS)
@@ -250,7 +253,9 @@ PATHS = (
 )
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.grad], ids=["forward", "reverse"])
+@pytest.mark.parametrize(
+    "mode", [pytest.param(jax.jacfwd, id="forward", marks=pytest.mark.slow), pytest.param(jax.grad, id="reverse")]
+)
 @pytest.mark.parametrize("how", cases(SOLVERS, "adaptive"))
 def test_derivatives_are_those_of_differences(how, mode, monkeypatch):
     loop = pair(plant=TwoTanks(coupling=0.3))
@@ -272,7 +277,7 @@ def test_derivatives_are_those_of_differences(how, mode, monkeypatch):
         np.testing.assert_allclose(derivative[i], difference, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("how", SOLVERS)
+@pytest.mark.parametrize("how", cases(SOLVERS, "adaptive"))
 def test_kernels_make_the_same_runs(how):
     loop = pair(plant=TwoTanks(coupling=0.3))
     batch = d.Batch({"controller.left.kp": jnp.linspace(2.0, 4.0, 8), "plant.time_b": jnp.linspace(1.0, 3.0, 8)})

@@ -210,8 +210,9 @@ def exact_wave_integral(p, end=2.0):
     return integral
 
 
+@pytest.mark.slow
 @killed_by("engine.step.advance", "& (regular | decision.crosses_surface)", "& regular")
-@pytest.mark.parametrize("step", ["fixed", pytest.param("adaptive", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step", ["fixed", "adaptive"])
 def test_a_wave_that_switches_during_a_slide_is_no_surface_to_slide_along(step):
     follows = {"follow_slides": True}
     solver = d.FixedStep(1e-2, 2.0, **follows) if step == "fixed" else d.Adaptive(1e-8, 2.0, 1e-2, **follows)

@@ -79,7 +79,7 @@ def mean(f):
     "after = LaggedReplay(new, carry.behind, log_attempt(old, new))",
     "after = carry._replace(ahead=new)",
 )
-@pytest.mark.parametrize("function", [warm, bounce])
+@pytest.mark.parametrize("function", [pytest.param(warm, marks=pytest.mark.slow), bounce])
 def test_gradients_are_those_of_forward_directions(function, engines):
     found = jax.jit(jax.grad(mean(function)))(INPUTS)
     known = jax.jit(jax.jacfwd(mean(function)))(INPUTS)
@@ -104,11 +104,13 @@ def test_a_run_that_diverges_has_no_derivative():
     np.testing.assert_allclose(found[~lost], known[~lost], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_refused_as_without_a_kernel():
     with pytest.raises(ValueError, match="adaptive steps have no second derivatives"):
         jax.hessian(mean(warm))(INPUTS)
 
 
+@pytest.mark.slow
 @killed_by(
     "engine.drive.deferred",
     "except (Unsupported, NoCompiler):\n        return []",

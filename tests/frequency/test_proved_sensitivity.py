@@ -269,6 +269,7 @@ def test_the_cured_loop_is_bounded_within_a_thousandth():
     assert prove_claim(equations, RIG, FrequencyClaim(worst * 0.9999)).verdict == "refuted"
 
 
+@pytest.mark.slow
 @killed_by("robust.frequency.opened", "split_off_delays(loop)[0].start().plant.distance", "loop.start().plant.distance")
 def test_five_parameters_of_the_rig_behind_a_delay():
     loop = dataclasses.replace(load("slip-lmi").loop, actuator=Delay(time=1e-3))

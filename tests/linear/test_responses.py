@@ -78,7 +78,9 @@ def compile_quickly(function):
     return jax.jit(function, compiler_options=SAME_RESULT_OPTIONS)
 
 
-@pytest.mark.parametrize("sampled", [False, True], ids=["continuous", "sampled"])
+@pytest.mark.parametrize(
+    "sampled", [pytest.param(False, id="continuous"), pytest.param(True, id="sampled", marks=pytest.mark.slow)]
+)
 @killed_by(
     "linear.responses.search", "step = jnp.where(usable, value, 0.0)", "step = jnp.where(usable, 0.9 * value, 0.0)"
 )
@@ -165,7 +167,8 @@ def test_two_equal_peaks_are_shown():
     assert peak.runner_up != peak.value
 
 
-@pytest.mark.parametrize("name", ["slip-cured", pytest.param("slip-lmi", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["slip-cured", "slip-lmi"])
 def test_loops_of_scenarios(name):
     loop = load(name).loop
     path = "controller.controller.gain" if name == "slip-cured" else "controller.gain"

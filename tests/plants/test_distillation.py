@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from mutants import killed_by
 from scipy.integrate import solve_ivp
 
@@ -142,6 +143,7 @@ def method_of_steps():
     return solution
 
 
+@pytest.mark.slow
 @killed_by("parts.actuators.per_control", "return signal._replace(**outputs)", "return signal")
 def test_the_column_agrees_with_the_method_of_steps():
     run = d.rollout(column(), d.FixedStep(0.1, DURATION))

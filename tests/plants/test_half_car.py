@@ -247,9 +247,8 @@ PATHS = (
 )
 
 
-@pytest.mark.parametrize(
-    "mode", [pytest.param(jax.jacfwd, id="forward"), pytest.param(jax.grad, id="reverse", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.grad], ids=["forward", "reverse"])
 def test_derivatives_are_those_of_differences(mode):
     """At three widths, whose errors are the fourth power of the width, and the rounding and step errors over it."""
     scenario = load("half-car")
