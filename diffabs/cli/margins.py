@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from diffabs.cli import console, show, show_margins, targets
-from diffabs.core.pytree import ParameterSpec
+from diffabs.core.pytree import ParameterSpec, replace
 from diffabs.core.types import JsonObject
 from diffabs.host import documents, provenance
 from diffabs.host.separated import read_decimal
@@ -39,6 +39,13 @@ def margins(
     plot: Annotated[
         pathlib.Path | None, typer.Option(help="Draw Bode, Nyquist and sensitivities to this file (.png, .pdf, .svg).")
     ] = None,
+    proof: Annotated[
+        pathlib.Path | None,
+        typer.Option(
+            metavar="FILE.json",
+            help="Show beside the worst what this file of certify --sensitivity proves, checked again.",
+        ),
+    ] = None,
     as_json: console.Json = False,
 ) -> None:
     """Compute stability margins of the linearised loop.
@@ -50,8 +57,9 @@ def margins(
         with targets.new_target_file(plot, "--plot") as picture:
             setup = console.load_scenario(scenario, changes, integrated=False)
             values, target = _read_places(setup, at or ())
-            if picture or setup.design.over:
-                console.refuse_several_controls(setup, "margins --plot" if picture else "margins over [design.over]")
+            if picture or proof or setup.design.over:
+                option = "margins --plot" if picture else "margins --proof" if proof else "margins over [design.over]"
+                console.refuse_several_controls(setup, option)
             try:
                 margin_results = console.run_with_progress(
                     lambda: examine_margins(setup, values, target, samples), f"linearising {setup.name}"
@@ -62,6 +70,8 @@ def margins(
                 console.fail(f"{setup.name}: {error}", console.FAILED)
             result = {"scenario": setup.name, **margin_results.record(), "versions": provenance.versions(), "files": {}}
             result = documents.stamp("margins", result)
+            proved = _read_proof(proof, margin_results, setup, values) if proof else {}
+            result["proved"] = proved
             has_channels = isinstance(margin_results, ScenarioChannelMargins)
             view = show_margins.show_channel_margins if has_channels else show_margins.show_margins
             show_result = partial(show.show_result, as_json, view, result, setup, margin_results)
@@ -71,6 +81,26 @@ def margins(
         result["files"] |= {"plot": str(plot)} if plot else {}
         show_result()
         _judge(setup, margin_results)
+
+
+def _read_proof(
+    file: pathlib.Path, results: ScenarioMargins | ScenarioChannelMargins, setup: Scenario, values: dict[str, float]
+) -> dict[str, float]:
+    """Return the margins that a file proves for the examined loops, by name; they are checked again."""
+    from diffabs.scenario.frequency_proofs import read_proved_margins
+
+    if isinstance(results, ScenarioChannelMargins):
+        raise ScenarioError("--proof is about a loop with one control")
+    loop = replace(setup.loop, values)
+    try:
+        return console.run_with_lines(
+            lambda tell: read_proved_margins(file, results, loop, tell).bounds(), f"verifying {file}"
+        )
+    except ModuleNotFoundError:
+        console.need_extra("proof")
+        raise
+    except ValueError as error:
+        console.fail(f"{file}: {' '.join(str(error).split())}")
 
 
 def _read_places(scenario: Scenario, options: Sequence[str]) -> tuple[dict[str, float], float | None]:

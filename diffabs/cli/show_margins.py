@@ -1,5 +1,6 @@
 """The view of stability margins."""
 
+import decimal
 import math
 
 from rich.table import Table
@@ -25,13 +26,16 @@ SHOWN_IN = {"phase": math.degrees(1), "delay": 1e3}
 
 
 def show_margins(result: JsonObject, scenario: Scenario, margins: ScenarioMargins) -> None:
-    """Show a table of the margins, with the worst value and its place."""
-    worst = margins.band.worst()
-    table = Table("margin", "here", *([f"worst of {len(margins.band.systems)}", "where"] if worst else []))
+    """Show a table of the margins, with the worst value and its place, and with what a file proves."""
+    worst, proved = margins.band.worst(), result["proved"]
+    columns = [*([f"worst of {len(margins.band.systems)}", "where"] if worst else []), *(["proved"] if proved else [])]
+    table = Table("margin", "here", *columns)
     for name, words in MARGIN_NAMES.items():
         row = [_format_margin(name, margins.nominal.margins)]
         if system := worst.get(name):
             row += [_format_margin(name, system.margins), format_place(system.values, scenario)]
+        if proved:
+            row += [""] * (len(columns) - len(row)) + ([format_bound(name, proved[name])] if name in proved else [])
         table.add_row(words, *row)
     tables.show_titled_table(_title(result, scenario), table)
     _show_notes(result, scenario)
@@ -71,6 +75,14 @@ def _format_margin(name: str, margins: Margins) -> str:
     if math.isnan(value):
         return "undecided" if name == "delay" and margins.stable else "none"
     return "no limit" if value == math.inf else f"{value * SHOWN_IN.get(name, 1.0):.4g}"
+
+
+def format_bound(name: str, bound: float) -> str:
+    """Return a proved bound; rounding does not claim more than is proved."""
+    digits = bound * SHOWN_IN.get(name, 1.0)
+    rounding = decimal.ROUND_CEILING if name == "sensitivity" else decimal.ROUND_FLOOR
+    exact = decimal.Context(prec=5, rounding=rounding).create_decimal(repr(digits))
+    return f"{'at most' if name == 'sensitivity' else 'at least'} {exact.normalize():f}"
 
 
 def _format_number(value: float) -> str:

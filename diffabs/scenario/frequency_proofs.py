@@ -5,16 +5,22 @@ proof.save("sensitivity.proof")
 """
 
 import dataclasses
+import math
 import os
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
+import jax
+import numpy as np
+
+from diffabs.core.pytree import get, replace
 from diffabs.core.types import JsonObject
 from diffabs.engine.solvers import FixedStep
 from diffabs.host import documents, files
 from diffabs.loop.closed_loop import Loop
 from diffabs.parts.objectives import default_objectives
-from diffabs.robust.frequency.certificate import frequency_document, verify_frequency
+from diffabs.robust.frequency.certificate import frequency_document, read_frequency_file, verify_frequency
 from diffabs.robust.frequency.opened import derive_opened
 from diffabs.robust.frequency.sensitivity import (
     FrequencyClaim,
@@ -25,6 +31,7 @@ from diffabs.robust.frequency.sensitivity import (
 )
 from diffabs.robust.reach.cover import check_box
 from diffabs.robust.reach.verification import FileVerdict
+from diffabs.scenario.robustness import ScenarioMargins
 from diffabs.scenario.scenario import Scenario, dump, loads
 
 
@@ -129,6 +136,79 @@ def prove_frequency(
     equations = derive_opened(loop, dict(over), target)
     proofs = [prove_claim(equations, over, claim, budget=budget, progress=progress) for claim in claims]
     return FrequencyProof(loop, over, target, tuple(proofs))
+
+
+class ProvedMargins(NamedTuple):
+    """Bounds of a loop's margins that a file proves for a box.
+
+    Attributes:
+        sensitivity: Bound of |S| over all frequencies; infinity without one.
+        delay: Added delay that keeps the loop stable [s]; 0 without one.
+        over: Range (low, high) of each parameter of the box, by path, in SI units.
+    """
+
+    sensitivity: float
+    delay: float
+    over: Mapping[str, tuple[float, float]]
+
+    def bounds(self) -> dict[str, float]:
+        """Return the bounds by the name of the margin, without those that the file does not state."""
+        peak = (
+            {} if math.isinf(self.sensitivity) else {"modulus": 1 / self.sensitivity, "sensitivity": self.sensitivity}
+        )
+        return peak | ({"delay": self.delay} if self.delay else {})
+
+
+def read_proved_margins(
+    path: str | os.PathLike[str], margins: ScenarioMargins, loop: Loop, progress: Callable[[str], None]
+) -> ProvedMargins:
+    """Return what a file proves about examined loops; its proof is checked in full before.
+
+    Args:
+        path: File of `FrequencyProof.save`.
+        margins: Margins of the loop at its values, and over ranges.
+        loop: The loop at these values.
+        progress: Called with a line about how far the check is.
+
+    Raises:
+        ValueError: The file is none, is not proved, or is about another loop or another box.
+        ModuleNotFoundError: python-flint is not installed.
+    """
+    from diffabs.scenario.proofs import FREQUENCY_PROOF, read_proof_document
+
+    document = read_proof_document(path, (FREQUENCY_PROOF,))
+    if document is None:
+        raise ValueError("no proof over all frequencies, as certify --sensitivity --out writes it")
+    file = read_frequency_file(document)
+    verdict, scenario, _ = verify_frequency_document(document, pathlib.Path(path).stem, 1.0, progress)
+    if verdict.reason:
+        raise ValueError(f"not proved: {verdict.reason}")
+    if file.target != margins.target or not _equal_outside(loop, scenario.loop, file.over):
+        raise ValueError("it is about another loop; certify this one")
+    for name, (low, high) in file.over.items():
+        value = float(np.asarray(get(loop, name)))
+        least, greatest = (pick([value, *margins.over.get(name, ())]) for pick in (min, max))
+        if not low <= least <= greatest <= high:
+            where = f"{name} in [{low:g}, {high:g}]"
+            raise ValueError(f"it is about {where}, and the margins are of {least:g} to {greatest:g}")
+    if outside := sorted(set(margins.over) - set(file.over)):
+        raise ValueError(f"it is about one value of {', '.join(outside)}, and the margins are of a range")
+    claims = [claim for claim, _ in file.claims]
+    return ProvedMargins(min(claim.bound for claim in claims), max(claim.added for claim in claims), file.over)
+
+
+def _equal_outside(loop: Loop, other: Loop, over: Mapping[str, tuple[float, float]]) -> bool:
+    """Return whether two loops are equal but for some parameters."""
+    try:
+        values = {path: np.full(np.shape(get(loop, path)), low) for path, (low, _) in over.items()}
+        loops = [jax.tree.flatten(replace(part, values)) for part in (loop, other)]
+    except ValueError:  # a parameter that the loop does not have
+        return False
+    (leaves, structure), (others, other_structure) = loops
+    return structure == other_structure and all(
+        np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=1e-12, atol=0.0, equal_nan=True)
+        for a, b in zip(leaves, others, strict=True)
+    )
 
 
 def verify_frequency_document(

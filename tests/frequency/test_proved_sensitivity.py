@@ -13,6 +13,7 @@ from commands import run as command
 from mutants import killed_by
 
 import diffabs as d
+from diffabs.cli import show_margins
 from diffabs.core.protocols import no_flow, no_memory
 from diffabs.core.pytree import param, pytree
 from diffabs.linear import margins, open_loop
@@ -369,7 +370,7 @@ def test_a_file_about_an_unstable_loop_is_refused():
 # The command.
 
 
-def test_the_command_proves_saves_and_verifies(tmp_path):
+def test_the_command_proves_saves_verifies_and_shows(tmp_path):
     pytest.importorskip("flint")
     over = ("--over", "plant.mass=5.3:6.2", "--over", "initial.speed=5:13.9")
     saved = ("--sensitivity", "2.6", "--delay-margin", "0.5 ms", "--out", tmp_path / "p.json", "--json")
@@ -378,6 +379,35 @@ def test_the_command_proves_saves_and_verifies(tmp_path):
     assert [row["claim"] for row in document["claims"]] == ["sensitivity <= 2.6", "delay margin >= 0.0005 s"]
     shown = command("verify", tmp_path / "p.json").stdout
     assert shown.count("proved  ") == 2
+    beside = ("margins", "slip-lmi", "--samples", "0", "--proof", tmp_path / "p.json")
+    own = ("--set", "design.over.plant.mass=5.3:6.2", "--set", "design.over.initial.speed=5:13.9")
+    content = json.loads(command(*beside, *own, "--json").stdout)
+    assert content["proved"] == {"modulus": 1 / 2.6, "sensitivity": 2.6, "delay": 0.5e-3}
+    assert content["worst"]["sensitivity"]["value"] <= 2.6
+
+
+@pytest.mark.slow
+def test_margins_refuse_a_proof_of_another_loop_or_box(tmp_path):
+    pytest.importorskip("flint")
+    own = ("slip-lmi", "--set", "design.over.plant.mass=5.3:6.2", "--set", "design.over.initial.speed=5:13.9")
+    command("certify", *own, "--sensitivity", "2.6", "--out", tmp_path / "p.json")
+    for more, message in {
+        ("--set", "plant.mass=5"): "plant.mass in [5.3, 6.2], and the margins are of 5 to 6.2",
+        ("--set", "design.over.plant.mass=5.3:6.3"): "plant.mass in [5.3, 6.2], and the margins are of 5.3 to 6.3",
+        ("--set", "design.over.road.w4=0.4:0.41"): "one value of road.w4, and the margins are of a range",
+        ("--at", "target=0.15"): "about another loop",
+        ("--set", "actuator.type=lag"): "about another loop",
+        ("--set", "controller.gain=[-11000.0, -48.0]"): "about another loop",
+    }.items():
+        refused = command("margins", *own, "--samples", "0", "--proof", tmp_path / "p.json", *more, status=2)
+        assert_one_error_line(refused)
+        assert message in refused.stderr
+
+
+def test_bounds_are_not_rounded_to_more_than_is_proved():
+    shown = [show_margins.format_bound(name, 0.123456789) for name in ("sensitivity", "modulus", "delay")]
+    assert shown == ["at most 0.12346", "at least 0.12345", "at least 123.45"]
+    assert show_margins.format_bound("sensitivity", 2.6) == "at most 2.6"
 
 
 def test_the_command_refutes():
