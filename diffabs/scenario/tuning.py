@@ -43,6 +43,11 @@ class Work(NamedTuple):
     constraints: JsonObject
     task: "ProofTask | None"
 
+    @property
+    def frequency_bounds(self) -> "FrequencyBounds | None":
+        """The bounds of [tune.constraints]; None without any."""
+        return self.constraints.get(MARGIN_CONSTRAINTS)
+
 
 def build_work(scenario: Scenario) -> Work:
     """Return the runs and constraints of a tuning."""

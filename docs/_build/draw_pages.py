@@ -14,11 +14,13 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 FIGURES = ROOT / "docs" / "figures"
 NOISE = "--set solver.step=1e-3 --set sensor=noise --set sensor.slip=0.005"
 SWEEP = f"sweep slip-lmi --samples 1000 {NOISE} --figures --out noisy"
+ROBUST = "tune slip-cured --set tune.constraints.sensitivity=1.7 --set tune.constraints.delay_margin=5e-3 --plot robust.png"
 # page: (folder in which it begins, command, the file that it draws)
 COMMANDS = {
     "first-run": (".", "simulate slip-cured --plot run.png", "run.png"),
     "margins": (".", "margins slip-cured --plot loop.png", "loop.png"),
     "plant-in-15-minutes": ("examples/dc-servo", "simulate servo.toml --parts dc_servo --plot run.png", "run.png"),
+    "robustness": (".", ROBUST, "robust.png"),
     "sweeps": (".", SWEEP, "noisy/figures/distributions.png"),
 }
 

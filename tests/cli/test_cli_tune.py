@@ -51,7 +51,7 @@ class Figure:
         pathlib.Path(path).write_text(self.text)
 
 
-def drawn(history, runs, *, title, lane, unit):
+def drawn(history, runs, *, title, lane, unit, bounds, boxes):
     return Figure(f"{title}: {len(history)} points, {', '.join(runs)}, {lane} [{unit}]")
 
 

@@ -5,9 +5,10 @@ import pytest
 from mutants import killed_by
 
 from diffabs.core.protocols import BrakeOutput, Sample
+from diffabs.linear import OpenLoop, Transfer
 from diffabs.loop.result import Trajectory
 from diffabs.output.plot import tuning as plots
-from diffabs.tune import DescentPoint
+from diffabs.tune import DescentPoint, FrequencyBounds
 
 HISTORY = [DescentPoint(i, 10.0 ** (1 - i), 1.0, 10.0**-i, max(0.0, 0.2 - 0.1 * i), 2 * i + 1) for i in range(5)]
 
@@ -85,3 +86,25 @@ def test_pareto_joins_the_front_and_shows_the_rest():
     np.testing.assert_array_equal(lines(ax)["published"], [[2], [4]])
     assert "stopping distance" in ax.get_ylabel()
     assert "effort" in ax.get_xlabel()
+
+
+@killed_by("output.plot.frequency", "ax.plot(w, values.max(axis=0)", "ax.plot(w, values.min(axis=0)")
+def test_sensitivities_over_a_box_are_drawn_with_their_bounds():
+    """Of L = k/(s (s + 1)), |S| = |s (s + 1)/(s^2 + s + k)| and |T| = |k/(s^2 + s + k)|."""
+
+    def loop(k):
+        integrator = Transfer(np.zeros((1, 1)), np.eye(1), np.eye(1), np.zeros((1, 1)))
+        lag = Transfer(-np.eye(1), np.eye(1), np.array([[-k]]), np.zeros((1, 1)))
+        return OpenLoop(integrator, lag, 0.0)
+
+    bounds = FrequencyBounds(sensitivity=1.6, shape=((0.1, 0.2), (10.0, 2.0)))
+    boxes = {"before": [loop(1.0), loop(4.0)], "after": [loop(0.5)]}
+    *_, sensitivity, complementary = plots.draw_tuning(HISTORY[:1], RUNS, bounds=bounds, boxes=boxes).axes[:6]
+    w = lines(sensitivity)["before"][0]
+    s = 1j * w
+    for name, gains in {"before": (1.0, 4.0), "after": (0.5,)}.items():
+        expected = np.array([[abs(s * (s + 1)), np.full(len(w), k)] / abs(s**2 + s + k) for k in gains]).max(axis=0)
+        np.testing.assert_allclose([lines(ax)[name][1] for ax in (sensitivity, complementary)], expected, rtol=1e-9)
+    np.testing.assert_array_equal(lines(sensitivity)["bound 1.6"][1], 1.6)
+    np.testing.assert_allclose(lines(sensitivity)["shape"][1], np.clip(0.2 * (w / 0.1) ** 0.5, 0.2, 2.0), rtol=1e-9)
+    assert "bound" not in " ".join(lines(complementary))

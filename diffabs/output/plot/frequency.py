@@ -1,7 +1,7 @@
 """Figure of a loop in the frequency domain: Bode and Nyquist plots and sensitivities, with the band of its box."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,7 +9,10 @@ from matplotlib.axes import Axes
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.robustness import frequencies
 from diffabs.linear.stability_margins import Margins
-from diffabs.output.plot.style import COLOURS, GREY, Sheet, label_axes, make_logarithmic, sheet
+from diffabs.output.plot.style import COLOURS, GREY, Sheet, curve_style, label_axes, make_logarithmic, sheet
+
+if TYPE_CHECKING:
+    from diffabs.tune import FrequencyBounds
 
 MAX_NYQUIST_RADIUS = 3.0  # largest real or imaginary part that the Nyquist plot shows
 LIGHT = 0.25  # opacity of the band
@@ -49,6 +52,42 @@ def loop_shape(loop: OpenLoop, margins: Margins, band: Sequence[OpenLoop] = (), 
         for ax in (magnitude, phase):
             ax.axvline(margins.crossover, color=GREY, linewidth=0.8, linestyle=":")
     return figure
+
+
+def draw_sensitivities(
+    sensitivity: Axes, complementary: Axes, boxes: Mapping[str, Sequence[OpenLoop]], bounds: "FrequencyBounds"
+) -> None:
+    """Draw the range of |S| and |T| over the loops of each box, and their bounds.
+
+    A box is a band from the least to the greatest value at each frequency; its upper edge is a line. Of a loop with
+    several channels the values are the largest singular values.
+    """
+    w = frequencies([loop for loops in boxes.values() for loop in loops])
+    for i, (name, loops) in enumerate(boxes.items()):
+        opened = np.array([loop.transfer().response(w) for loop in loops])
+        identity = np.eye(opened.shape[-1])
+        closed = np.linalg.inv(identity + opened)
+        for ax, values in ((sensitivity, closed), (complementary, identity - closed)):
+            _draw_range(ax, w, np.linalg.norm(values, 2, axis=(2, 3)), name, i)
+    for ax, bound in ((sensitivity, bounds.sensitivity), (complementary, bounds.complementary)):
+        if bound is not None:
+            ax.axhline(bound, color=GREY, linewidth=1.2, linestyle=":", label=f"bound {bound:g}")
+    if bounds.shape:
+        at, limits = np.array(bounds.shape).T
+        shown = np.exp(np.interp(np.log(w), np.log(at), np.log(limits)))
+        sensitivity.plot(w, shown, color=GREY, linewidth=1.2, linestyle=":", label="shape")
+    for ax, name in ((sensitivity, "|S|"), (complementary, "|T|")):
+        make_logarithmic(ax, "x")
+        ax.set_xlim(w[0], w[-1])
+        ax.set_ylim(0, None)
+        label_axes(ax, "frequency [rad/s]", f"{name} over the box [1]")
+
+
+def _draw_range(ax: Axes, w: np.ndarray, values: np.ndarray, name: str, i: int) -> None:
+    """Draw the band of some curves (k, n) over the frequencies, with its upper edge as a line."""
+    style = curve_style(i)
+    ax.fill_between(w, values.min(axis=0), values.max(axis=0), color=style["color"], alpha=LIGHT, linewidth=0)
+    ax.plot(w, values.max(axis=0), label=name, **style)
 
 
 def _response(loop: OpenLoop, w: np.ndarray) -> Any:

@@ -10,9 +10,11 @@ import numpy as np
 from diffabs.core.channels import outputs_like
 from diffabs.core.types import PyTree, Scalar
 from diffabs.core.units import control_units
+from diffabs.linear.opened_loop import OpenLoop, open_loop
 from diffabs.loop.closed_loop import Loop
 from diffabs.loop.result import Trajectory
 from diffabs.loop.run import rollout
+from diffabs.output.plot.frequency import draw_sensitivities
 from diffabs.output.plot.style import (
     COLOURS,
     GREY,
@@ -28,7 +30,7 @@ from diffabs.output.plot.style import (
 
 if TYPE_CHECKING:
     from diffabs.scenario.tuning import Work
-    from diffabs.tune import Tuned
+    from diffabs.tune import FrequencyBounds, Tuned
 
 MARKS = "osD^v"
 MAX_DECADES = 5.0  # an objective that falls by less is easier to read on a linear axis
@@ -36,10 +38,23 @@ SETTLED_MULTIPLE = 1.5  # length of the time axis, in transients
 
 
 def draw_tuning(
-    points: Sequence[PyTree], runs: Mapping[str, Trajectory], *, title: str = "", lane: str = "", unit: str = "N m"
+    points: Sequence[PyTree],
+    runs: Mapping[str, Trajectory],
+    *,
+    title: str = "",
+    lane: str = "",
+    unit: str = "N m",
+    bounds: "FrequencyBounds | None" = None,
+    boxes: Mapping[str, Sequence[OpenLoop]] | None = None,
 ) -> Figure:
-    """Return the figure of `diffabs tune`: convergence above, the runs before and after below."""
-    figure, (objective, gradient, slip, torque) = sheet(2, 2, title=title, size=(5.8, 3.1))
+    """Return the figure of `diffabs tune`: convergence above, the runs before and after below.
+
+    With `bounds` a third row has |S| and |T| of the loops of the `boxes`, before and after.
+    """
+    figure, axes = sheet(3 if bounds else 2, 2, title=title, size=(5.8, 3.1))
+    objective, gradient, slip, torque, *closed = axes
+    if bounds and boxes:
+        draw_sensitivities(closed[0], closed[1], boxes, bounds)
     _objective(objective, points)
     _gradient(gradient, points)
     _runs(slip, torque, runs, lane and f"worst lane: {lane}", unit)
@@ -57,10 +72,17 @@ def draw_worst_run(work: "Work", tuned: "Tuned") -> Figure:
         assert run.trajectory is not None
         return run.trajectory
 
-    runs = {"before": roll_out(scenario.loop), "after": roll_out(tuned.loop)}
+    loops = {"before": scenario.loop, "after": tuned.loop}
+    runs = {name: roll_out(loop) for name, loop in loops.items()}
+    bounds, boxes = work.frequency_bounds, {}
+    if bounds:
+        points = bounds.points
+        boxes = {
+            name: [open_loop(points.lane(loop, i)) for i in range(max(points.size, 1))] for name, loop in loops.items()
+        }
     where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
     title, unit = scenario.title or scenario.name, ", ".join({*control_units(scenario.loop.plant).values()})
-    return draw_tuning(tuned.history, runs, title=title, lane=where, unit=unit)
+    return draw_tuning(tuned.history, runs, title=title, lane=where, unit=unit, bounds=bounds, boxes=boxes)
 
 
 def draw_pareto(
