@@ -187,10 +187,10 @@ def read_proved_margins(
         raise ValueError("it is about another loop; certify this one")
     for name, (low, high) in file.over.items():
         value = float(np.asarray(get(loop, name)))
-        least, greatest = (pick([value, *margins.over.get(name, ())]) for pick in (min, max))
-        if not low <= least <= greatest <= high:
+        lowest, highest = (pick([value, *margins.over.get(name, ())]) for pick in (min, max))
+        if not low <= lowest <= highest <= high:
             where = f"{name} in [{low:g}, {high:g}]"
-            raise ValueError(f"it is about {where}, and the margins are of {least:g} to {greatest:g}")
+            raise ValueError(f"it is about {where}, and the margins are of {lowest:g} to {highest:g}")
     if outside := sorted(set(margins.over) - set(file.over)):
         raise ValueError(f"it is about one value of {', '.join(outside)}, and the margins are of a range")
     claims = [claim for claim, _ in file.claims]
