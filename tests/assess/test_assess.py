@@ -54,7 +54,7 @@ def pretended_runs(cars, **metrics):
     return SimpleNamespace(metrics=values), stops
 
 
-@killed_by("assess.clauses", "RATE = 30 * KMH / GRAVITY", "RATE = 25 * KMH / GRAVITY")
+@killed_by("assess.clauses", "RATE = 30 * ONE_KMH / GRAVITY", "RATE = 25 * ONE_KMH / GRAVITY")
 @killed_by("assess.clauses", "jnp.degrees(program.steering_ratio", "jnp.degrees(1.0 + 0.0 * program.steering_ratio")
 def test_figures_are_those_of_the_formulas():
     runs, stops = pretended_runs(2)
