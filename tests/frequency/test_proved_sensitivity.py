@@ -394,7 +394,7 @@ def test_margins_refuse_a_proof_of_another_loop_or_box(tmp_path):
     for more, message in {
         ("--set", "plant.mass=5"): "plant.mass in [5.3, 6.2], and the margins are of 5 to 6.2",
         ("--set", "design.over.plant.mass=5.3:6.3"): "plant.mass in [5.3, 6.2], and the margins are of 5.3 to 6.3",
-        ("--set", "design.over.road.w4=0.4:0.41"): "one value of road.w4, and the margins are of a range",
+        ("--set", "design.over.road.w4=0.4:0.41"): "one value of plant.road.w4, and the margins are of a range",
         ("--at", "target=0.15"): "about another loop",
         ("--set", "actuator.type=lag"): "about another loop",
         ("--set", "controller.gain=[-11000.0, -48.0]"): "about another loop",
