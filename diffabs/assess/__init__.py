@@ -14,7 +14,7 @@ from diffabs.assess.clauses import Figures as Figures
 from diffabs.assess.clauses import assess as assess
 from diffabs.assess.clauses import clause_figures as clause_figures
 from diffabs.assess.runs import RuleStop as RuleStop
-from diffabs.assess.runs import TestProgram as TestProgram
+from diffabs.assess.runs import StopProgram as StopProgram
 from diffabs.assess.runs import plan_stops as plan_stops
 from diffabs.assess.runs import run_stops as run_stops
 from diffabs.assess.surfaces import make_surface as make_surface

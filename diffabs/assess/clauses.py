@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.assess.runs import ONE_KMH, Population, RuleStop, TestProgram, plan_stops, run_stops, tyre_fields
+from diffabs.assess.runs import ONE_KMH, Population, RuleStop, StopProgram, plan_stops, run_stops, tyre_fields
 from diffabs.core.types import Array, JsonObject, Scalar
 from diffabs.engine.solvers import Solver
 from diffabs.loop.closed_loop import Loop
@@ -122,7 +122,7 @@ class Assessment(NamedTuple):
 
 
 def assess(
-    loop: Loop, solver: Solver, program: TestProgram | None = None, population: Population | None = None
+    loop: Loop, solver: Solver, program: StopProgram | None = None, population: Population | None = None
 ) -> Assessment:
     """Assess a car, or each car of a population, by the clauses.
 
@@ -143,7 +143,7 @@ def assess(
         Traceback (most recent call last):
         ValueError: MirroredRig has no tyres on roads of their own; HalfCar and Car have them
     """
-    program, population = program or TestProgram(), population or {}
+    program, population = program or StopProgram(), population or {}
     check_program(program)
     prescribed = (*(f"plant.{name}" for name in tyre_fields(loop.plant)), "initial.")
     if fixed := [path for path in population if path.startswith(prescribed)]:
@@ -157,7 +157,7 @@ def assess(
     return Assessment(clauses, len(failed), len(stops), int(np.sum(passed)))
 
 
-def check_program(program: TestProgram) -> None:
+def check_program(program: StopProgram) -> None:
     """Raise ValueError for coefficients of adhesion, a load, a speed or a time that the rules exclude."""
     for name, (low, high, unit) in PROGRAM_RANGES.items():
         if not low <= getattr(program, name) <= high:
@@ -166,7 +166,7 @@ def check_program(program: TestProgram) -> None:
         raise ValueError(f"high = {program.high:g} is below 2 low = {2 * program.low:g}; clause 5.3.2 needs that ratio")
 
 
-def clause_figures(runs: Run, stops: list[RuleStop], program: TestProgram) -> list[Figures]:
+def clause_figures(runs: Run, stops: list[RuleStop], program: StopProgram) -> list[Figures]:
     """Return the figures of all clauses, differentiable by whatever the `runs` of `run_stops` depend on."""
     metrics = {name: jnp.reshape(value, (-1, len(stops))) for name, value in runs.metrics.items()}
     locked = jnp.max(jnp.stack([value for name, value in metrics.items() if name.startswith("locked_")]), axis=0)

@@ -33,7 +33,7 @@ HIGH, LOW = (False, False), (True, True)
 Population = Mapping[str, AnyArray]  # parameters of several cars by path, shape (cars,)
 
 
-class TestProgram(NamedTuple):
+class StopProgram(NamedTuple):
     """What the regulation leaves to the test house.
 
     Attributes:
@@ -87,16 +87,33 @@ def tyre_fields(plant: Part) -> tuple[str, ...]:
     return names
 
 
-def plan_stops(plant: Part, program: TestProgram) -> list[RuleStop]:
+def plan_stops(plant: Part, program: StopProgram) -> list[RuleStop]:
     """Return the stops of the clauses: unladen, then laden. A split road needs a car with two sides."""
     split = any("left" in name for name in tyre_fields(plant))
     return [stop for laden in (False, True) for stop in _plan_load(laden, float(program.fast), split)]
 
 
 def run_stops(
-    loop: Loop, solver: Solver, stops: list[RuleStop], program: TestProgram, population: Population | None = None
+    loop: Loop,
+    solver: Solver,
+    stops: list[RuleStop],
+    program: StopProgram,
+    population: Population | None = None,
+    objectives: Mapping[str, Objective] | None = None,
 ) -> Run:
-    """Return the runs of all stops with their metrics, shape (cars, stops) or (stops,). Also for a traced loop."""
+    """Return the runs of all stops, those of a car after another; also for a traced loop.
+
+    Args:
+        loop: Loop of the car, whose tyres, stop, mass and speed the stops replace.
+        solver: Solver with a duration that lasts for the longest stop.
+        stops: Stops of each car.
+        program: Roads, load and speeds.
+        population: Parameters of several cars by path, shape (cars,); without one there is one car.
+        objectives: Further metrics by name.
+
+    Returns:
+        Runs with metrics of shape (cars * stops,).
+    """
     population, columns, plant = population or {}, {}, loop.plant
     cars = next((len(column) for column in population.values()), 1)
     curves = make_surface(program.high, slippery=False), make_surface(program.low, slippery=True)
@@ -113,7 +130,7 @@ def run_stops(
     empty = columns.get("plant.mass", get(loop, "plant.mass"))
     columns["plant.mass"] = empty + jnp.tile(program.load * _stack(stop.laden for stop in stops), cars)
     ready = replace(loop, {"plant": plant, "stop": SpeedReached(speed=15 * ONE_KMH)})
-    return run_batch(ready, Batch(columns), solver, _objectives(loop.plant, program))
+    return run_batch(ready, Batch(columns), solver, {**_objectives(loop.plant, program), **(objectives or {})})
 
 
 def _plan_load(laden: bool, fast: float, split: bool) -> Iterator[RuleStop]:
@@ -129,7 +146,7 @@ def _plan_load(laden: bool, fast: float, split: bool) -> Iterator[RuleStop]:
         yield RuleStop("split", 50.0, laden, HIGH, LOW, NO_EDGE)
 
 
-def _objectives(plant: Part, program: TestProgram) -> dict[str, Objective]:
+def _objectives(plant: Part, program: StopProgram) -> dict[str, Objective]:
     """Return the objectives of every stop."""
     locked: dict[str, Objective] = {
         f"locked_{slip}": InChannel(objective=LockedTime(), control=f"{slip.removesuffix('_slip')}_brake", output=slip)

@@ -38,13 +38,13 @@ def assess_brakes(
     With --cars it estimates the probability that a car of the distribution in [sweep.over] meets all clauses.
     Exit status: 0 all clauses are met, 1 one is not, or undecided, 2 wrong input."""
     with console.end_on_errors():
-        from diffabs.assess import TestProgram, assess
+        from diffabs.assess import StopProgram, assess
         from diffabs.assess.clauses import check_program
         from diffabs.assess.runs import tyre_fields
         from diffabs.scenario.section_sweep import build_study
 
         setup = console.load_scenario(scenario, changes)
-        program = TestProgram(high, low, load, fast, steering_ratio, brief)
+        program = StopProgram(high, low, load, fast, steering_ratio, brief)
         try:
             check_program(program)
             tyre_fields(setup.loop.plant)

@@ -13,7 +13,7 @@ from mutants import killed_by
 from scipy.optimize import minimize_scalar
 
 import diffabs as d
-from diffabs.assess import TestProgram as Program
+from diffabs.assess import StopProgram as Program
 from diffabs.assess import assess, clause_figures, make_surface, peak_friction
 from diffabs.assess.clauses import check_program
 from diffabs.assess.runs import plan_stops, run_stops

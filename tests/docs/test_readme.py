@@ -38,6 +38,7 @@ ELSEWHERE = {  # commands of the table that other tests execute; a study with fe
     "python experiments/best_slip/run.py": (
         "tests/references/test_best_slip.py::test_no_rule_beats_the_bound_and_tuning_shortens"
     ),
+    "diffabs simulate": "tests/plants/test_car.py::test_the_page_tells_how_far_a_car_turns_on_a_split_road",
     "python experiments/lq_weights/run.py": (
         "tests/experiments/test_experiments.py::test_gradients_need_fewer_rollouts_than_searches_without"
     ),

@@ -175,10 +175,22 @@ def gains_of_rules(tables):
     return printed
 
 
+def stops_of_controllers(tables):
+    def cells(row):
+        percent = [f"{row[name]:.1f} %" for name in row if "over least" in name]
+        locked = [f"{row[name]:.2f} s" for name in row if name.startswith("locked")]
+        split = [f"{row['split: distance [m]']:.1f} m", f"{row['split: yaw [rad]']:.2f} rad"]
+        split += [f"{row['split: lateral [m]']:.2f} m", f"{row['split: steering wheel [deg]']:.0f} deg"]
+        return [*percent, *locked, *split, f"{row['all clauses [% of cars]']:.1f} %"]
+
+    return {row["controller"]: cells(row) for row in tables["table"]}
+
+
 @pytest.mark.parametrize(
     ("name", "printed"),
     [
         ("best_slip", distances_above_the_bound),
+        ("car_controllers", stops_of_controllers),
         ("lab_rig", critical_lags),
         ("mean_intervals", coverages),
         ("slip_estimator", distances_behind_an_edge),
