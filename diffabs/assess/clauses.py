@@ -100,12 +100,14 @@ class Assessment(NamedTuple):
         cars: Number of cars.
         stops: Number of stops of each.
         passed: Number of cars that meet all confirmed clauses.
+        unfinished: Number of runs that diverged, or did not reach 15 km/h. Their cars do not pass.
     """
 
     clauses: tuple[Clause, ...]
     cars: int
     stops: int
     passed: int
+    unfinished: int
 
     def probability(self) -> IntervalEstimate:
         """Return the probability that a car of the distribution meets all confirmed clauses (Clopper and Pearson)."""
@@ -118,7 +120,8 @@ class Assessment(NamedTuple):
         ]
         share = self.probability()
         interval = {"probability": share.value, "interval": [share.low, share.high]} if self.cars > 1 else {}
-        return {"cars": self.cars, "stops": self.stops, "passed": self.passed, **interval, "clauses": rows}
+        counts = {name: getattr(self, name) for name in ("cars", "stops", "passed", "unfinished")}
+        return {**counts, **interval, "clauses": rows}
 
 
 def assess(
@@ -154,7 +157,7 @@ def assess(
     failed = (np.asarray(runs.diverged) | ~np.asarray(runs.stopped)).reshape(-1, len(stops))
     clauses = tuple(_judge(figures, stops, failed) for figures in clause_figures(runs, stops, program))
     passed = np.all([clause.met for clause in clauses if clause.confirmed], axis=0)
-    return Assessment(clauses, len(failed), len(stops), int(np.sum(passed)))
+    return Assessment(clauses, len(failed), len(stops), int(np.sum(passed)), int(np.sum(failed)))
 
 
 def check_program(program: StopProgram) -> None:

@@ -73,6 +73,10 @@ def _show_assessment(result: JsonObject, assessment: "Assessment", scenario: Sce
     tables.show_titled_table(f"{scenario.title or scenario.name}: {assessment.stops} stops", table)
     if any(not row.confirmed for row in assessment.clauses):
         console.say(UNCONFIRMED)
+    if assessment.unfinished:
+        console.say(
+            f"warning: {assessment.unfinished:,} runs diverged or did not reach 15 km/h; their cars do not pass"
+        )
     if several:
         share = assessment.probability()
         console.say(
