@@ -45,6 +45,7 @@ bench: $(VENV)/.bench
 	$(BIN)/python benchmarks/bench_sweep.py
 	$(BIN)/python benchmarks/bench_studies.py
 	$(BIN)/python benchmarks/bench_yardsticks.py
+	$(BIN)/python benchmarks/bench_car.py
 
 # the same with the peers that need environments of their own
 bench-peers: $(VENV)/.bench $(VENV)-torch/.installed $(VENV)-jaxonomy/.installed

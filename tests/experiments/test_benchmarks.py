@@ -182,6 +182,20 @@ def test_the_yardsticks_agree(tmp_path, monkeypatch):
     assert all(row["error"] < 1e-9 for row in module("bench_gpu").ensemble(40, "float64", 1))
 
 
+@pytest.mark.slow
+def test_the_car_by_hand_is_the_car_of_our_parts(monkeypatch):
+    """Kernel and C++ agree on every run; with another driver in the C++ the benchmark refuses to compare."""
+    bench = module("bench_car")
+    taken = bench.measured(lanes=12, step=1e-3, rounds=1, threads=1)
+    assert len(taken["rows"]) == 3
+    assert all(row["difference"] < 1e-12 and row["runs_per_s_and_core"] > 0 for row in taken["rows"].values())
+    assert taken["error_of_step"] < 1e-7
+    constants = bench.constants()
+    monkeypatch.setattr(bench, "constants", lambda: constants | {"GAIN": "0.0301"})
+    with pytest.raises(SystemExit, match=r"C\+\+, flags of the kernel: the ends differ by"):
+        bench.measured(lanes=12, step=1e-3, rounds=1, threads=1)
+
+
 RECORD = {"loops": {"lmi": {"rows": {"forward 1": {"ratio": 2.0}, "reverse": {"ratio": 6.0}}}}}
 
 
