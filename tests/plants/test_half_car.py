@@ -1,5 +1,7 @@
 """The half car against CommonRoad's single-track model, closed forms, SciPy, the quarter car, and differences."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -277,6 +279,29 @@ def test_the_scenario_stops_without_a_locked_wheel():
     speeds = np.linspace(0.0, 100 / 3.6, 1001)
     least = np.trapezoid(speeds / (GRAVITY * np.asarray(roads.DRY_ASPHALT.friction(0.1, speeds))), speeds)
     assert least < metrics["stop_distance"] < 1.06 * least
+
+
+FIXED = ("solver=fixed", "solver.duration=5", "stop=speed-reached", "stop.speed=5")
+
+
+@killed_by("parts.plants.half_car", "class HalfCar(SlipProbes)", "class HalfCar")
+def test_fixed_steps_may_be_as_long_as_the_stiffest_wheel_allows():
+    """At the stop's speed, not at rest: the rate of a free wheel there is r^2 Fz c1 c2/(J v), and RK4 bears 2.785."""
+    load("half-car", [*FIXED, "solver.step=8e-4"])
+    stiffest = CAR.radius**2 * 5916.82 * (1.2801 * 23.99 - 0.52) / (1.7 * 5.0)
+    with pytest.raises(ValueError, match=r"only with steps in \(0, ([\d.e-]+)\] s") as refusal:
+        load("half-car", [*FIXED, "solver.step=2e-3"])
+    limit = float(re.search(r"\(0, ([\d.e-]+)\]", str(refusal.value))[1])
+    assert 0.6 < limit / (2.785 / stiffest) < 1.2
+
+
+@pytest.mark.slow
+def test_fixed_and_adaptive_steps_agree():
+    distances = []
+    for changes in (FIXED, FIXED[1:]):
+        scenario = load("half-car", [*changes, *(["solver.step=8e-4"] if changes is FIXED else [])])
+        distances.append(d.measure(scenario.loop, scenario.solver, scenario.objectives).metrics["stop_distance"])
+    np.testing.assert_allclose(*distances, rtol=1e-6)
 
 
 def test_the_page_prints_what_it_says():

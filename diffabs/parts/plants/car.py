@@ -35,7 +35,7 @@ from diffabs.core.pytree import param, part, pytree, static
 from diffabs.core.types import Any, PyTree, Scalar
 from diffabs.parts.controllers import PID, Clamping, HoldCourse, NoFeedforward, PerChannel, SelectLow
 from diffabs.parts.objectives import InChannel, LockedTime, PeakOutput, StopDistance, StopTime
-from diffabs.parts.plants.wheel import GRAVITY, BrakeStart, forward_speed, halt_at_zero, slip_ratio
+from diffabs.parts.plants.wheel import GRAVITY, BrakeStart, SlipProbes, forward_speed, halt_at_zero, slip_ratio
 from diffabs.parts.references import FilteredSlip, PerTarget
 from diffabs.parts.roads import RoadTyre
 from diffabs.parts.stops import Standstill
@@ -161,7 +161,7 @@ ForceOfLoad = Callable[[Scalar], TyreForces]
 
 
 @pytree
-class Car:
+class Car(SlipProbes):
     """A car with four braked wheels that may yaw and slide, and steering.
 
     See also:

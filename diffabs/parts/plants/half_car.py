@@ -28,7 +28,7 @@ from diffabs.core.pytree import param, part, pytree, static
 from diffabs.core.types import Any, PyTree, Scalar
 from diffabs.parts.controllers import PID, Clamping, NoFeedforward, PerChannel
 from diffabs.parts.objectives import BRAKING, InChannel, StopDistance, StopTime
-from diffabs.parts.plants.wheel import GRAVITY, BrakeStart, forward_speed, halt_at_zero, slip_ratio
+from diffabs.parts.plants.wheel import GRAVITY, BrakeStart, SlipProbes, forward_speed, halt_at_zero, slip_ratio
 from diffabs.parts.references import FilteredSlip, PerTarget
 from diffabs.parts.roads import RoadTyre
 from diffabs.parts.stops import Standstill
@@ -109,7 +109,7 @@ class Axles(NamedTuple):
 
 
 @pytree
-class HalfCar:
+class HalfCar(SlipProbes):
     """Two braked axles on a straight road, with load transfer by the real deceleration.
 
     See also:

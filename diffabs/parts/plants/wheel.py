@@ -1,9 +1,11 @@
 """Common functions of braked wheels: slip, standstill, the start of a run, and the default loop."""
 
+from functools import reduce
+
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.numerics import larger, quotient
+from diffabs.core.numerics import larger, quotient, smaller
 from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Part, PyTree, Scalar
@@ -53,10 +55,36 @@ def forward_speed(speed: Scalar) -> Scalar:
     return jnp.where(jnp.greater(speed, STANDSTILL_SPEED), speed, 0.0)
 
 
-class BrakedWheel:
-    """Base of plants with a braked wheel on a `road`; `crawl_speed` [m/s] is the least denominator of the slip."""
+class SlipProbes:
+    """Base of plants whose stiffest state is a wheel; `crawl_speed` [m/s] is the least denominator of the slip."""
 
     crawl_speed: Scalar
+
+    def probes(self, initial: BrakeStart, setpoint: PyTree, stop: Part) -> BrakeStart:
+        """Return k starts at which the loop may be stiffest, as a `BrakeStart` of arrays (k,).
+
+        They combine 6 speeds from the start's to the stop's with 23 slips. Some slips are close to the setpoint, where
+        the controller is not at a limit; of several setpoints these are the least and the greatest. Other slips cover
+        the friction curve, which is steepest near 0.
+
+        Under a stop without a speed, such as `NoStop`, a run may last to standstill. The least speed is then the
+        plant's crawl speed. The slip's denominator, and with it the stiffness, is the same at all lower speeds.
+        """
+        setpoints = jax.tree.leaves(setpoint)
+        if len(setpoints) > 1:
+            setpoints = [reduce(smaller, setpoints), reduce(larger, setpoints)]
+        offsets = jnp.array(PROBED_OFFSETS)
+        near = jnp.concatenate([end + sign * offsets for end in setpoints for sign in (-1.0, 1.0)])
+        slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(PROBED_SLIPS)])
+        slowest = stop.speed if hasattr(stop, "speed") else self.crawl_speed
+        speeds = jnp.geomspace(initial.speed, slowest, PROBED_SPEEDS)
+        speed, slip = jnp.meshgrid(speeds, slips, indexing="ij")
+        return jax.tree.map(jnp.ravel, BrakeStart(speed=speed, slip=slip))
+
+
+class BrakedWheel(SlipProbes):
+    """Base of plants with a braked wheel on a `road`."""
+
     road: Road
 
     shows = BrakeOutput
@@ -89,19 +117,3 @@ class BrakedWheel:
 
     def usual_objectives(self) -> dict[str, PyTree]:
         return dict(BRAKING)
-
-    def probes(self, initial: BrakeStart, setpoint: Scalar, stop: Part) -> BrakeStart:
-        """Return k starts at which the loop may be stiffest, as a `BrakeStart` of arrays (k,).
-
-        They combine 6 speeds from the start's to the stop's with 23 slips. Some slips are close to the setpoint, where
-        the controller is not at a limit. Other slips cover the friction curve, which is steepest near 0.
-
-        Under a stop without a speed, such as `NoStop`, a run may last to standstill. The least speed is then the
-        plant's crawl speed. The slip's denominator, and with it the stiffness, is the same at all lower speeds.
-        """
-        near = jnp.concatenate([setpoint - jnp.array(PROBED_OFFSETS), setpoint + jnp.array(PROBED_OFFSETS)])
-        slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(PROBED_SLIPS)])
-        slowest = stop.speed if hasattr(stop, "speed") else self.crawl_speed
-        speeds = jnp.geomspace(initial.speed, slowest, PROBED_SPEEDS)
-        speed, slip = jnp.meshgrid(speeds, slips, indexing="ij")
-        return jax.tree.map(jnp.ravel, BrakeStart(speed=speed, slip=slip))
