@@ -135,12 +135,40 @@ def low_discrepancy_points(count: int, dimensions: int) -> Float[np.ndarray, "{c
     return (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
 
 
-def frequencies(systems: Sequence[OpenLoop], decades: float = 1.5, count: int = 400) -> Float[np.ndarray, " {count}"]:
-    """Return logarithmically spaced frequencies (count,) [rad/s], `decades` beyond the crossovers of these loops.
+def frequencies(loops: Sequence[OpenLoop]) -> Float[np.ndarray, " n"]:
+    """Return 400 frequencies [rad/s] around the crossovers of these loops, as `frequencies_around`."""
+    return frequencies_around([margins(loop).crossover for loop in loops], [loop.period for loop in loops])
 
-    They end at half the lowest sampling rate at most. Without any crossover they surround 1 rad/s.
+
+def frequencies_around(
+    crossovers: Sequence[float], periods: Sequence[float | None], decades: float = 1.5, count: int = 400
+) -> Float[np.ndarray, " {count}"]:
+    """Return logarithmically spaced frequencies (count,) [rad/s], `decades` beyond the crossovers [rad/s].
+
+    They end at half the lowest sampling rate at most; the periods [s] are None in continuous time. Without any
+    crossover they surround 1 rad/s.
     """
-    crossovers = [m.crossover for m in map(margins, systems) if math.isfinite(m.crossover)] or [1.0]
-    low, high = min(crossovers) * 10**-decades, max(crossovers) * 10**decades
-    half = [math.pi / loop.period for loop in systems if loop.period]
+    finite = [crossover for crossover in crossovers if math.isfinite(crossover)] or [1.0]
+    low, high = min(finite) * 10**-decades, max(finite) * 10**decades
+    half = [math.pi / period for period in periods if period]
     return np.geomspace(low, min([high, *half]), count)
+
+
+def sensitivity_gains(loops: Sequence[OpenLoop], w: np.ndarray) -> tuple[Float[np.ndarray, "k n"], ...]:
+    """Return |S| and |T|, each (k, n), of k loops at n frequencies [rad/s].
+
+    Of a loop with several channels they are the largest singular values.
+    """
+    opened = np.array([loop.transfer().response(w) for loop in loops])
+    identity = np.eye(opened.shape[-1])
+    sensitivity = np.linalg.inv(identity + opened)
+    return tuple(np.linalg.norm(gain, 2, axis=(2, 3)) for gain in (sensitivity, identity - sensitivity))
+
+
+def shape_bound(shape: Sequence[tuple[float, float]], w: np.ndarray) -> Float[np.ndarray, " n"]:
+    """Return the bound of |S| at frequencies [rad/s] by rows (frequency [rad/s], bound).
+
+    It is straight between the rows on logarithmic axes, and constant outside.
+    """
+    at, limits = np.log(np.array(shape).T)
+    return np.exp(np.interp(np.log(w), at, limits))

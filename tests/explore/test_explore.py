@@ -24,6 +24,8 @@ from diffabs.cli import console
 from diffabs.core.pytree import get, parameters, replace
 from diffabs.host.values import ScenarioError
 from diffabs.linear import margins, open_loop
+from diffabs.linear.opened_loop import OpenLoop
+from diffabs.linear.robustness import System
 from diffabs.linear.stability_margins import closed_loop_poles
 from diffabs.linear.transfer import Transfer
 from diffabs.loop.run import rollout
@@ -403,33 +405,44 @@ def test_poles_of_a_closed_loop_are_those_of_its_polynomial():
 def test_margins_are_those_of_the_library(session):
     chosen = session.scenario()
     found, oracle = (
-        stability.linear_stability(chosen, stability.linearise_corners(chosen)),
+        stability.linear_stability(chosen, stability.linearise_box(chosen)),
         margins(open_loop(chosen.loop)),
     )
     assert found.stable
     assert found.margins["phase"] == oracle.phase
     assert found.margins["gain_up"] == oracle.gain[1]
-    assert found.corners.systems == 4  # mass, and speed between start and stop
-    assert found.corners.worst["phase"] <= found.margins["phase"]
+    assert found.box.systems == 8  # corners of mass, and speed between start and stop; four points inside
+    assert found.box.worst["phase"] <= found.margins["phase"]
     assert np.all(found.poles.real < 0)
+    w, here, goal = found.sensitivity
+    assert np.max(here) == pytest.approx(1 / oracle.modulus, rel=1e-2)
+    assert np.all(goal == math.inf)
+    np.testing.assert_allclose(stability.sensitivity_curve(chosen, w).gain, here, rtol=1e-12)
+    w, least, greatest = found.box.sensitivity
+    inside = stability.sensitivity_curve(chosen, w).gain  # this loop is a corner
+    assert np.all((least <= inside * (1 + 1e-9)) & (inside <= greatest * (1 + 1e-9)))
+    assert np.max(greatest / least) > 1.5
+    lost = dataclasses.replace(chosen, loop=replace(chosen.loop, {"controller.gain": (11753.0, 48.0)}))
+    assert np.all(np.isnan(stability.sensitivity_curve(lost, w).gain))
 
 
 @pytest.mark.slow
 @killed_by("output.explore.stability", "if earlier and earlier.of == of:", "if earlier:")
 @killed_by("output.explore.stability", "if earlier and earlier.of == of:", "if False:")
-def test_corners_are_looked_at_again_only_where_they_move(session):
-    first = stability.linearise_corners(session.scenario())
+def test_the_box_is_looked_at_again_only_where_it_moves(session):
+    first = stability.linearise_box(session.scenario())
     turn(session, "plant.mass", "5.5")  # has a range in [design.over]
-    assert stability.linearise_corners(session.scenario(), first) is first
+    assert stability.linearise_box(session.scenario(), first) is first
     turn(session, "controller.gain.1", "-60")
-    moved = stability.linearise_corners(session.scenario(), first)
+    moved = stability.linearise_box(session.scenario(), first)
     assert moved is not first
-    fresh = stability.linearise_corners(session.scenario())
+    fresh = stability.linearise_box(session.scenario())
     np.testing.assert_array_equal(moved.poles, fresh.poles)
     assert (moved.worst, moved.unstable, moved.systems) == (fresh.worst, fresh.unstable, fresh.systems)
+    np.testing.assert_array_equal(moved.sensitivity, fresh.sensitivity)
     turn(session, "plant.mass", "6")
-    found = stability.linearise_corners(session.scenario(), moved)
-    whole = stability.linearise_corners(session.scenario())
+    found = stability.linearise_box(session.scenario(), moved)
+    whole = stability.linearise_box(session.scenario())
     np.testing.assert_array_equal(found.poles, whole.poles)
     assert found.worst == whole.worst
 
@@ -521,20 +534,20 @@ def test_a_tuning_names_the_bounds_at_which_it_ended(file):
     assert sentences(-110.0, -16.0) == ()
 
 
-@killed_by("output.explore.tuning", "if loop.corners.unstable:", "if False:")
+@killed_by("output.explore.tuning", "if loop.box.unstable:", "if False:")
 @pytest.mark.slow
-def test_unstable_corners_are_named(file):
+def test_unstable_points_are_named(file):
     """By the poles of the closed loops; a positive gain drives the slip away."""
     now = Session(str(file(SHORT))).scenario()
     lost = dataclasses.replace(now, loop=replace(now.loop, {"controller.gain": (11753.0, 48.0)}))
     assert tuning.describe_instability(lost) == (
-        "the loop is not stable; 4 of 4 corners of [design.over] are not stable"
+        "the loop is not stable; 8 of 8 points of [design.over] are not stable"
     )
     assert all(np.any(closed_loop_poles(open_loop(loop).transfer()).real > 0) for loop in (lost.loop,))
 
 
 @pytest.mark.slow
-def test_nothing_is_said_of_stable_corners(file):
+def test_nothing_is_said_of_stable_points(file):
     assert tuning.describe_instability(Session(str(file(SHORT))).scenario()) == ""
 
 
@@ -702,10 +715,61 @@ def test_each_channel_has_panels_of_its_own():
 
 @killed_by("output.explore.charts", "poles[np.isfinite(poles)]", "poles")
 def test_a_loop_that_is_not_well_posed_shows_no_poles():
-    nothing = stability.CornerLoops((), np.array([]), {}, 0, 0)
-    loop = stability.Stability(None, 0.0, np.array([np.nan, -1.0]), {}, False, nothing)
+    empty = stability.SensitivityCurve(*np.empty((3, 0)))
+    loop = stability.Stability(None, 0.0, np.array([np.nan, -1.0]), {}, False, empty, stability.NO_BOX)
     change = json.loads(json.dumps(charts.change_poles(loop), allow_nan=False))
     assert [series["data"] for series in change["series"]] == [[], [[-1.0, 0.0]]]
+
+
+def _integrator_with_lag(gain: float) -> System:
+    """Return L = gain/(s (s + 1)), opened."""
+    a, b, c = np.array([[0.0, 1.0], [0.0, -1.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
+    plant = Transfer(a, b, c, np.zeros((1, 1)))
+    controller = Transfer(
+        np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-gain]])
+    )  # negative feedback
+    opened = OpenLoop(plant, controller, 0.0)
+    return System({}, opened, margins(opened))
+
+
+@killed_by("output.explore.stability", "gains.min(axis=0), gains.max(axis=0)", "gains.max(axis=0), gains.max(axis=0)")
+@killed_by("output.explore.stability", "if not all(system.margins.stable for system in systems):", "if False:")
+@killed_by("linear.robustness", "in (sensitivity, identity - sensitivity)", "in (identity - sensitivity, sensitivity)")
+def test_the_range_of_sensitivities_is_that_of_closed_forms():
+    gains = (0.5, 2.0, 7.0)
+    w, least, greatest = stability.find_sensitivity_range([_integrator_with_lag(gain) for gain in gains])
+    s = 1j * w
+    exact = np.abs([s * (s + 1) / (s**2 + s + gain) for gain in gains])
+    np.testing.assert_allclose(least, exact.min(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(greatest, exact.max(axis=0), rtol=1e-9)
+    crossover = math.sqrt((math.sqrt(1 + 4 * 7.0**2) - 1) / 2)  # |L| = 1: w^4 + w^2 = k^2
+    assert w[-1] == pytest.approx(crossover * 10**1.5)
+    unstable = stability.find_sensitivity_range([_integrator_with_lag(gain) for gain in (2.0, -1.0)])
+    assert unstable.w.size == 0
+
+
+@killed_by("output.explore.charts", '"step": high - low}', '"step": high}')
+@killed_by("output.explore.charts", "max(LEAST_SHOWN_DB, bottom)", "bottom")
+def test_the_chart_of_sensitivities_is_in_decibels():
+    curve = stability.SensitivityCurve(
+        np.array([0.2, 2.0, 20.0]), np.array([0.0, 10.0, np.nan]), np.array([np.inf, 1.0, 2.0])
+    )
+    over = stability.SensitivityRange(np.array([0.3, 30.0]), np.array([0.001, 1.0]), np.array([0.1, 100.0]))
+    change = json.loads(json.dumps(charts.change_sensitivity(curve, over), allow_nan=False))
+    here, box = (dataset["source"] for dataset in change["dataset"])
+    assert here == {"w": [0.2, 2.0, 20.0], "s": [None, 20.0, None], "goal": [None, 0.0, 6.0206]}
+    assert box == {"w": [0.3, 30.0], "low": [-60.0, 0.0], "step": [40.0, 40.0]}  # on top of the least
+    assert change["xAxis"] == [{"min": 0.1, "max": 100.0}]
+    assert change["yAxis"] == [{"min": -40.0, "max": 40, "interval": 10}]
+
+
+@killed_by("linear.robustness", "np.exp(np.interp(np.log(w), at, limits))", "np.interp(w, *np.array(shape).T)")
+def test_the_goal_of_sensitivity_is_the_lower_bound(file):
+    constraints = "[tune.constraints]\nsensitivity = 2.0\nshape = [[1.0, 0.1], [100.0, 10.0]]\n"
+    now = Session(str(file(SHORT + constraints))).scenario()
+    w = np.array([0.1, 1.0, 10.0, 100.0])
+    curve = stability.find_sensitivity_goal(now, w)
+    np.testing.assert_allclose(curve, [0.1, 0.1, 1.0, 2.0])
 
 
 @killed_by("output.explore.charts", "third - quarter, high - third", "third - quarter, high - low")
@@ -723,7 +787,8 @@ def test_charts_are_plain_json_whatever_a_run_was():
     bands = tuple(np.array([[0.0], [1.0], [2.0], [4.0], [8.0]]) for _ in range(2))
     steps = charts.change_fan(Fan(np.array([0.0]), bands, 200, 0, 0, ""))["dataset"][0]["source"]
     assert [steps[f"0.{i}"] for i in range(4)] == [[0.0], [1.0], [3.0], [4.0]]  # each on top of the one before
-    json.dumps([charts.run_chart(found), change, charts.pole_chart(), charts.change_poles(None)], allow_nan=False)
+    empty = [charts.pole_chart(), charts.change_poles(None), charts.sensitivity_chart()]
+    json.dumps([charts.run_chart(found), change, *empty], allow_nan=False)
 
 
 @killed_by("output.explore.guard", "len(host) == 1 and host[0] in self.hosts", "len(host) == 1")

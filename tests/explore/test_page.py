@@ -28,6 +28,10 @@ pytestmark = pytest.mark.usefixtures("any_step_is_stable")
 EXPLORE = pathlib.Path(diffabs.output.explore.page.__file__).parent
 NAME = 'my metric :title="alert(1)"'
 LIMIT_S = 60.0
+CURVE = stability.SensitivityCurve(np.array([1.0, 10.0]), np.array([0.5, 1.5]), np.full(2, math.inf))
+LOOP = stability.Stability(
+    None, 0.0, np.array([-1.0]), dict.fromkeys(stability.MARGIN_KEYS, 2.0), True, CURVE, stability.NO_BOX
+)
 
 
 class Jobs:
@@ -360,7 +364,7 @@ def test_an_error_stops_no_other_result(visit, monkeypatch, failing):
         await opened.draw()
         monkeypatch.setattr(page.chart, "change", changes.append)
         monkeypatch.setattr(curves, "run_fan", broken if failing == "fan" else lambda *given: None)
-        monkeypatch.setattr(page, "_poles", lambda *given, corners=False: asked.append(corners))
+        monkeypatch.setattr(page, "_poles", lambda *given, box=False: asked.append(box))
         if failing == "run":
             monkeypatch.setattr(curves, "run_curves", broken)
         page.thinker.run()
@@ -490,12 +494,12 @@ def test_a_tuning_that_cannot_start_says_why(visit, monkeypatch):
 
 @killed_by("output.explore.tuner", '"NOT tuned" if tuned.unstable else "tuned"', '"tuned"')
 @killed_by("output.explore.tuner", "(tuned.unstable, *tuned.at_bounds)", "(tuned.unstable,)")
-def test_a_result_with_unstable_corners_is_not_called_tuned(visit):
+def test_a_result_with_an_unstable_box_is_not_called_tuned(visit):
     async def user(opened):
         tuner, now = opened.page.tuner, opened.session.scenario()
         found = tuning.TuningFound(now, True, "it ended", ("gain 2 is at its lower bound, -300 N m",), "")
         drawn = Curves(np.array([0.0]), (), dict.fromkeys(now.objectives, 1.0), "", draft=False)
-        for unstable, head in (("", "tuned"), ("1 of 4 corners of [design.over] are not stable", "NOT tuned")):
+        for unstable, head in (("", "tuned"), ("1 of 8 points of [design.over] are not stable", "NOT tuned")):
             with opened.client:
                 tuner._table(now, found._replace(unstable=unstable), drawn, drawn)
             assert opened.find("tuned").text == head
@@ -566,27 +570,60 @@ def test_a_failed_tuning_is_told_to_its_own_scenario(visit, left):
     "        if version >= self.oldest_valid:\n            self.learned",
     "        if True:\n            self.learned",
 )
-def test_no_corners_of_the_scenario_before(visit, monkeypatch):
+def test_no_box_of_the_scenario_before(visit, monkeypatch):
     async def user(opened):
         page, shown = opened.page, []
 
         def linearise(now, known):
             with opened.client:
                 page.begin()  # while the thinker is at the old scenario
-            return stability.CornerLoops((), None, {}, 0, 0)
+            return stability.NO_BOX
 
         monkeypatch.setattr(curves, "run_fan", lambda *given: None)
-        monkeypatch.setattr(stability, "linear_stability", lambda now, around: shown.append(around) or "none")
+        monkeypatch.setattr(stability, "linear_stability", lambda now, around: shown.append(around) or LOOP)
         await opened.draw()
         with monkeypatch.context() as patch:
-            patch.setattr(stability, "linearise_corners", linearise)
+            patch.setattr(stability, "linearise_box", linearise)
             page.thinker.run()
         await asyncio.sleep(0)
         shown.clear()
-        monkeypatch.setattr(stability, "linearise_corners", broken)
+        monkeypatch.setattr(stability, "linearise_box", broken)
         await opened.draw()
         page.thinker.run()
         assert shown == [None]
+
+    visit(user)
+
+
+@killed_by("output.explore.page", "        if self.frequencies is None:\n", "        if True:\n")
+@killed_by("output.explore.page", "_sentence(error), True, None", "_sentence(error), True, self.frequencies")
+def test_a_drag_redraws_the_sensitivity_without_the_margins(visit, monkeypatch):
+    async def user(opened):
+        page, drawn = opened.page, []
+        monkeypatch.setattr(curves, "run_fan", lambda *given: None)
+        monkeypatch.setattr(stability, "linearise_box", lambda now, known: stability.NO_BOX._replace(systems=3))
+        monkeypatch.setattr(stability, "box_of", lambda now: ())
+        monkeypatch.setattr(stability, "linear_stability", lambda now, box: LOOP._replace(box=box or stability.NO_BOX))
+        monkeypatch.setattr(stability, "sensitivity_curve", lambda now, w: drawn.append(w) or CURVE._replace(w=w))
+        await opened.draw()
+        page.thinker.run()
+        await asyncio.sleep(0)
+        page.learned["poles"] = math.inf
+        monkeypatch.setattr(page, "_wait_for_rest", lambda *given: False)
+        drawn.clear()
+        opened.enter("plant.mass", "5.5")
+        await opened.draw()
+        page.thinker.run()
+        await asyncio.sleep(0)
+        assert [list(w) for w in drawn] == [[1.0, 10.0]]
+        shown = "band: least to greatest |S| at 3 points of [design.over]"
+        assert page.results.about_sensitivity.text == shown
+
+        monkeypatch.setattr(stability, "linear_stability", broken)
+        page._poles(page.session.scenario(), page.version)
+        assert not page._sensitivity(page.session.scenario(), page.version)
+        await asyncio.sleep(0)
+        assert not page.results.sensitivity_card.visible
 
     visit(user)
 
@@ -595,13 +632,13 @@ def test_no_corners_of_the_scenario_before(visit, monkeypatch):
 def test_a_quick_fan_is_slow_in_another_scenario(visit, monkeypatch):
     async def user(opened):
         page, done = opened.page, []
-        for name in ("poles", "fan"):
+        for name in ("poles", "sensitivity", "fan"):
             monkeypatch.setattr(page, f"_{name}", lambda *given, **more: done.append(1) or True)
         await opened.draw()
         page.thinker.run()
         await asyncio.sleep(0)
         monkeypatch.setattr(page, "_wait_for_rest", lambda *given: False)  # a drag
-        for begin, quick in ((page.redraw, 2), (page.begin, 0)):
+        for begin, quick in ((page.redraw, 3), (page.begin, 0)):
             done.clear()
             with opened.client:
                 begin()

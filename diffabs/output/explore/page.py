@@ -1,4 +1,4 @@
-"""The page of one tab: sliders on the left, curves in the middle, verdict, poles and metrics on the right."""
+"""The page of one tab: sliders on the left, curves in the middle, verdict, poles, |S| and metrics on the right."""
 
 import asyncio
 import contextlib
@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
+import numpy as np
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.host.values import ScenarioError
@@ -51,8 +52,9 @@ class Page:
         self.shown: Curves | None = None
         self.refused_version: int = 0  # version of a refusal, whose message stays
         self.switching: asyncio.Lock = asyncio.Lock()  # scenario and parts change one after the other
-        self.learned: dict[str, Any] = {}  # of this scenario: seconds of each step, and the corners computed last
-        self.corners_current: bool = False  # whether the poles shown last had the corners of their own loop
+        self.learned: dict[str, Any] = {}  # of this scenario: seconds of each step, and the box computed last
+        self.box_current: bool = False  # whether the poles shown last had the box of their own loop
+        self.frequencies: np.ndarray | None = None  # rad/s, of the loop whose poles were shown last; None without one
         self.drawer, self.thinker = (NewestJobThread(thread) for _ in range(2))
         self.controls: Controls = Controls(session, self._change, self._replaced, self._widen)
         self.results: ResultsPanel = ResultsPanel()
@@ -250,6 +252,10 @@ class Page:
         if version >= self.oldest_valid:
             self.results.stability(loop_stability, fresh=whole and version == self.version)
 
+    def _show_sensitivity(self, curve: stability.SensitivityCurve, version: int) -> None:
+        if version >= self.oldest_valid:
+            self.results.sensitivity(curve)
+
     def _show_verdict(self, verdict: ProofVerdict, version: int) -> None:
         if version == self.version:
             self.results.verdict(verdict)
@@ -283,7 +289,7 @@ class Page:
         """Compute everything except the curve: quick results during a drag, the others after a rest."""
         if version != self.version:
             return
-        steps = {"poles": self._poles, "fan": self._fan}
+        steps = {"poles": self._poles, "sensitivity": self._sensitivity, "fan": self._fan}
         quick = [name for name in steps if self.learned.get(name, math.inf) < QUICK_JOB_S]
         for name in quick:
             self._time_step(name, steps[name], now, version)
@@ -295,8 +301,8 @@ class Page:
         for name in steps:
             if name not in quick and version == self.version:
                 self._time_step(name, steps[name], now, version)
-        if version == self.version and not self.corners_current:
-            self._poles(now, version, corners=True)
+        if version == self.version and not self.box_current:
+            self._poles(now, version, box=True)
         if self._wait_for_rest(PROVING, version):
             self.later(self._show_verdict, _verdict(self.tools.prove, now), version)
         objections(now)  # compiles the check now, before the next edit needs it
@@ -314,23 +320,38 @@ class Page:
             time.sleep(min(remaining, 0.02))
         return version == self.version
 
-    def _poles(self, now: Scenario, version: int, *, corners: bool = False) -> bool:
-        """Show poles and margins of this loop, and return whether there are any.
+    def _poles(self, now: Scenario, version: int, *, box: bool = False) -> bool:
+        """Show poles, margins and |S| of this loop, and return whether there are any.
 
-        The corners are the cached ones, or with `corners` they are computed for this loop.
+        Those of the box are the cached ones, or with `box` they are computed for this loop.
         """
         shown: Any
-        around = self.learned.get("corners")
+        around = self.learned.get("box")
         try:
-            if corners:
-                around = stability.linearise_corners(now, around)
-                self.later(self._learn, "corners", around, version)
+            if box:
+                around = stability.linearise_box(now, around)
+                self.later(self._learn, "box", around, version)
             shown = stability.linear_stability(now, around)
-            self.corners_current = around is not None and around.of == stability.corners_of(now)
+            self.box_current = around is not None and around.of == stability.box_of(now)
+            self.frequencies = shown.sensitivity.w
         except Exception as error:  # the card shows every error, and the thread goes on
-            shown, self.corners_current = _sentence(error), True
-        self.later(self._show_stability, shown, version, self.corners_current)
+            shown, self.box_current, self.frequencies = _sentence(error), True, None
+        self.later(self._show_stability, shown, version, self.box_current)
         return not isinstance(shown, str)
+
+    def _sensitivity(self, now: Scenario, version: int) -> bool:
+        """Show |S| at the frequencies of the loop whose poles were shown last, and return whether there is any.
+
+        It takes a fraction of the time of the margins, so it follows a drag.
+        """
+        if self.frequencies is None:
+            return False
+        try:
+            curve = stability.sensitivity_curve(now, self.frequencies)
+        except Exception:  # the step of the poles says the same, and why
+            return False
+        self.later(self._show_sensitivity, curve, version)
+        return True
 
     def _fan(self, now: Scenario, version: int) -> bool:
         fan = curves.run_fan(now, self.session.spread)

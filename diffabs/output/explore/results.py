@@ -1,5 +1,6 @@
-"""The right column: verdict, map of poles, margins, and metrics of the run."""
+"""The right column: verdict, map of poles, |S| over frequency, margins, and metrics of the run."""
 
+import numpy as np
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.core.types import JsonObject, PyTree
@@ -8,7 +9,7 @@ from diffabs.output.explore.canvas import Canvas
 from diffabs.output.explore.knobs import unit_words
 from diffabs.output.explore.panels import NO_VALUE, format_reading
 from diffabs.output.explore.session import CERTIFIED, REFUTED, UNDECIDED, ProofVerdict
-from diffabs.output.explore.stability import Stability, format_margin
+from diffabs.output.explore.stability import BoxLoops, SensitivityCurve, Stability, format_margin
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 
@@ -45,6 +46,11 @@ class ResultsPanel:
         self.map: Canvas = Canvas(charts.pole_chart(), "poles", "poles")
         self.none: ui.label = ui.label("").classes("note").props("data-id=about-poles")
         self.poles_of: ui.label = ui.label("").classes("note").props("data-id=poles-of")
+        with ui.element("div") as self.sensitivity_card:
+            with ui.element("div").classes("card-title"):
+                ui.label("sensitivity S of the linearised loop")
+            self.sensitivity_map: Canvas = Canvas(charts.sensitivity_chart(), "sensitivity", "sensitivity")
+            self.about_sensitivity: ui.label = ui.label("").classes("note").props("data-id=about-sensitivity")
         table = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
         self.margin_cells: dict[str, tuple[PyTree, PyTree]] = {}
         with table.props("data-id=margins"):
@@ -94,7 +100,7 @@ class ResultsPanel:
             self.cells[name].set_text(format_reading(value))
 
     def stability(self, outcome: Stability | str, *, fresh: bool) -> None:
-        """Show poles and margins, or the reason why there are none.
+        """Show poles, margins and |S|, or the reason why there are none.
 
         `outcome` is the stability or the reason as text. `fresh` says that it belongs to the current numbers.
         """
@@ -102,12 +108,21 @@ class ResultsPanel:
         loop = None if isinstance(outcome, str) else outcome
         self.map.change(charts.change_poles(loop))
         self.map.element.set_visibility(loop is not None)
+        self.sensitivity_card.set_visibility(loop is not None)
+        if loop:
+            self.box: BoxLoops = loop.box
+            self.sensitivity(loop.sensitivity)
         self.none.set_text(outcome if isinstance(outcome, str) else self._of_poles(outcome))
         for name, (here, worst) in self.margin_cells.items():
-            lowest = loop.corners.worst if loop else {}
+            lowest = loop.box.worst if loop else {}
             here.set_text(format_margin(name, loop.margins[name], loop.stable) if loop else NO_VALUE)
             worst.set_text(format_margin(name, lowest[name], stable=True) if name in lowest else NO_VALUE)
         self.loop.set_text("" if loop is None else "stable" if loop.stable else "NOT STABLE")
+
+    def sensitivity(self, curve: SensitivityCurve) -> None:
+        """Show |S| of the loop, over the box that was shown last."""
+        self.sensitivity_map.change(charts.change_sensitivity(curve, self.box.sensitivity))
+        self.about_sensitivity.set_text(self._of_sensitivity(curve, self.box))
 
     def verdict(self, verdict: ProofVerdict) -> None:
         """Show the verdict of the proof."""
@@ -125,10 +140,22 @@ class ResultsPanel:
 
     @staticmethod
     def _of_poles(loop: Stability) -> str:
-        """Return a line about the map: sampling, delay, and the corners behind the worst margins."""
+        """Return a line about the map: sampling, delay, and the points behind the worst margins."""
         kind = f"sampled every {1e3 * loop.period:g} ms, shown as ln(z)/T" if loop.period else "continuous time"
         late = f", {1e3 * loop.delay:g} ms of delay" if loop.delay else ""
-        around = loop.corners
+        around = loop.box
         lost = f", {around.unstable} NOT stable" if around.unstable else ""
-        corners = f"; grey and worst: {around.systems} corners of [design.over]{lost}" if around.systems else ""
-        return f"{kind}{late}{corners}"
+        points = f"; grey and worst: {around.systems} points of [design.over]{lost}" if around.systems else ""
+        return f"{kind}{late}{points}"
+
+    @staticmethod
+    def _of_sensitivity(curve: SensitivityCurve, box: BoxLoops) -> str:
+        """Return a line about the curve of |S|, its band and its goal, with the reason why one is missing."""
+        lines = [] if np.isfinite(curve.gain).any() else ["no curve: the loop is not stable"]
+        if box.unstable:
+            lines.append("no band: a loop of [design.over] is not stable")
+        elif box.systems:
+            lines.append(f"band: least to greatest |S| at {box.systems} points of [design.over]")
+        if np.isfinite(curve.goal).any():
+            lines.append("dashed: goal of [tune.constraints]")
+        return "; ".join(lines)

@@ -1,24 +1,51 @@
-"""Poles and margins of the linearised loop, for the current values and at the corners of the [design.over] ranges."""
+"""Poles, margins and |S| of the linearised loop, for the current values and over the box of [design.over]."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from diffabs.core.channels import need_single_control
 from diffabs.core.pytree import replace
 from diffabs.core.types import PyTree
-from diffabs.linear.robustness import band
-from diffabs.linear.stability_margins import Margins, closed_loop_poles
+from diffabs.linear.opened_loop import OpenLoop, open_loop
+from diffabs.linear.robustness import System, band, frequencies_around, sensitivity_gains, shape_bound
+from diffabs.linear.stability_margins import Margins, closed_loop_poles, is_stable
 from diffabs.scenario.scenario import Scenario
 
 MOST_RANGES = 3  # three ranges have 8 corners, quick enough to follow a drag
+INSIDE = 4  # points inside of the box, besides its corners
+FREQUENCIES = 160  # points of a curve over frequency
 
 MARGIN_KEYS = ("gain_up", "gain_down", "phase", "delay", "modulus")
 
 
+class SensitivityRange(NamedTuple):
+    """Least and greatest |S| [1] of some loops at frequencies w [rad/s]; empty if a loop is unstable."""
+
+    w: np.ndarray
+    least: np.ndarray
+    greatest: np.ndarray
+
+
+NO_RANGE = SensitivityRange(*np.empty((3, 0)))
+
+
+class SensitivityCurve(NamedTuple):
+    """|S| [1] of a loop, and its bound in [tune.constraints], at frequencies w [rad/s].
+
+    |S| is NaN for an unstable loop, and the bound is infinite if there is none.
+    """
+
+    w: np.ndarray
+    gain: np.ndarray
+    goal: np.ndarray
+
+
 class Stability(NamedTuple):
-    """Poles and margins of a loop, linearised at rest on its setpoint.
+    """Poles, margins and |S| of a loop, linearised at rest on its setpoint.
 
     Attributes:
         period: Sampling period of the controller [s], or None in continuous time.
@@ -26,7 +53,8 @@ class Stability(NamedTuple):
         poles: Poles of the closed loop, in z for a sampled loop, else in s.
         margins: Margins by name, in SI.
         stable: Whether the loop with the current values is stable.
-        corners: Poles and worst margins at the corners of the ranges.
+        sensitivity: |S| of the loop, and its goal.
+        box: Poles, worst margins and |S| over the box of the ranges.
     """
 
     period: float | None
@@ -34,20 +62,22 @@ class Stability(NamedTuple):
     poles: np.ndarray
     margins: dict[str, float]
     stable: bool
-    corners: "CornerLoops"
+    sensitivity: SensitivityCurve
+    box: "BoxLoops"
 
 
-class CornerLoops(NamedTuple):
-    """Poles and worst margins at the corners of the ranges of [design.over].
+class BoxLoops(NamedTuple):
+    """Poles, worst margins and |S| over the box of [design.over]: at its corners, and at some points inside.
 
-    The corners do not depend on the current values of the parameters that have a range.
+    They do not depend on the current values of the parameters that have a range.
 
     Attributes:
-        of: Key of `corners_of`: equal keys mean equal corners.
-        poles: Poles of all corners.
-        worst: Worst margins by name; empty without corners or with an unstable corner.
-        unstable: Number of unstable corners.
-        systems: Number of corners.
+        of: Key of `box_of`: equal keys mean equal boxes.
+        poles: Poles at all points.
+        worst: Worst margins by name; empty without points or with an unstable loop.
+        unstable: Number of points with an unstable loop.
+        systems: Number of points.
+        sensitivity: |S| at all points.
     """
 
     of: tuple[PyTree, ...]
@@ -55,10 +85,14 @@ class CornerLoops(NamedTuple):
     worst: dict[str, float]
     unstable: int
     systems: int
+    sensitivity: SensitivityRange
 
 
-def corners_of(scenario: Scenario) -> tuple[PyTree, ...]:
-    """Return a key for comparison: it is equal for two scenarios if their corners are equal.
+NO_BOX = BoxLoops((), np.array([]), {}, 0, 0, NO_RANGE)
+
+
+def box_of(scenario: Scenario) -> tuple[PyTree, ...]:
+    """Return a key for comparison: it is equal for two scenarios if their boxes are equal.
 
     It holds the ranges, and the loop with each ranged parameter at its lower end.
     """
@@ -69,26 +103,27 @@ def corners_of(scenario: Scenario) -> tuple[PyTree, ...]:
     return kind, tuple(ranges.items()), *(np.asarray(leaf).tobytes() for leaf in leaves)
 
 
-def linearise_corners(scenario: Scenario, earlier: CornerLoops | None = None) -> CornerLoops:
-    """Return poles and worst margins of the linearised loops at the corners of the [design.over] ranges.
+def linearise_box(scenario: Scenario, earlier: BoxLoops | None = None) -> BoxLoops:
+    """Return poles, worst margins and |S| of the linearised loops over the box of [design.over].
 
-    A scenario without ranges, or with more than three, gets a result with zero corners. `earlier` is returned if the
-    corners have not changed. Raises ValueError for a loop without a linear model.
+    A scenario without ranges, or with more than three, gets a result with zero points. `earlier` is returned if the
+    box has not changed. Raises ValueError for a loop without a linear model.
     """
-    of = corners_of(scenario)
+    of = box_of(scenario)
     if earlier and earlier.of == of:
         return earlier
     ranges = scenario.design.ranges(scenario.loop)
     if not 0 < len(ranges) <= MOST_RANGES:
-        return CornerLoops(of, np.array([]), {}, 0, 0)
-    over = band(scenario.loop, ranges, 0)
+        return NO_BOX._replace(of=of)
+    over = band(scenario.loop, ranges, INSIDE)
     worst = {name: margin_values(system.margins)[name] for name, system in over.worst().items() if name in MARGIN_KEYS}
     poles = np.concatenate([closed_loop_poles(system.loop.transfer()) for system in over.systems])
-    return CornerLoops(of, poles, worst, len(over.unstable), len(over.systems))
+    systems = over.systems
+    return BoxLoops(of, poles, worst, len(over.unstable), len(systems), find_sensitivity_range(systems))
 
 
-def linear_stability(scenario: Scenario, corners: CornerLoops | None) -> Stability:
-    """Return poles and margins of the linearised loop. Raises ValueError for a loop without a linear model."""
+def linear_stability(scenario: Scenario, box: BoxLoops | None) -> Stability:
+    """Return poles, margins and |S| of the linearised loop. Raises ValueError for a loop without a linear model."""
     here = band(scenario.loop, {}, 0).systems[0]
     return Stability(
         here.loop.period,
@@ -96,8 +131,45 @@ def linear_stability(scenario: Scenario, corners: CornerLoops | None) -> Stabili
         closed_loop_poles(here.loop.transfer()),
         margin_values(here.margins),
         here.margins.stable,
-        corners or CornerLoops((), np.array([]), {}, 0, 0),
+        _sensitivity(scenario, here.loop, _frequencies([here]), stable=here.margins.stable),
+        box or NO_BOX,
     )
+
+
+def sensitivity_curve(scenario: Scenario, w: np.ndarray) -> SensitivityCurve:
+    """Return |S| and its goal at frequencies w [rad/s], without the margins, which take longer.
+
+    Raises ValueError for a loop without a linear model.
+    """
+    need_single_control(scenario.loop.plant, "the curve of |S|")
+    loop = open_loop(scenario.loop)
+    return _sensitivity(scenario, loop, w, stable=is_stable(loop.transfer()))
+
+
+def _sensitivity(scenario: Scenario, loop: OpenLoop, w: np.ndarray, *, stable: bool) -> SensitivityCurve:
+    gain = sensitivity_gains([loop], w)[0][0] if stable else np.full(w.shape, math.nan)
+    return SensitivityCurve(w, gain, find_sensitivity_goal(scenario, w))
+
+
+def find_sensitivity_goal(scenario: Scenario, w: np.ndarray) -> np.ndarray:
+    """Return the lower one of the bounds `sensitivity` and `shape` of |S| in [tune.constraints], infinity without."""
+    constraints = scenario.tune.constraints
+    bound = np.full(w.shape, constraints.sensitivity or math.inf)
+    return np.minimum(bound, shape_bound(constraints.shape, w)) if constraints.shape else bound
+
+
+def _frequencies(systems: Sequence[System]) -> np.ndarray:
+    crossovers, periods = zip(*((system.margins.crossover, system.loop.period) for system in systems), strict=True)
+    return frequencies_around(crossovers, periods, count=FREQUENCIES)
+
+
+def find_sensitivity_range(systems: Sequence[System]) -> SensitivityRange:
+    """Return the least and the greatest |S| of some systems, around their crossovers."""
+    if not all(system.margins.stable for system in systems):
+        return NO_RANGE
+    w = _frequencies(systems)
+    gains, _ = sensitivity_gains([system.loop for system in systems], w)
+    return SensitivityRange(w, gains.min(axis=0), gains.max(axis=0))
 
 
 def margin_values(margins: Margins) -> dict[str, float]:

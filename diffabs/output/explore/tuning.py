@@ -12,7 +12,7 @@ from diffabs.core.types import PyTree
 from diffabs.host.values import ScenarioError
 from diffabs.loop.batch import Batch
 from diffabs.output.explore.knobs import Knob
-from diffabs.output.explore.stability import linear_stability, linearise_corners
+from diffabs.output.explore.stability import linear_stability, linearise_box
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.tuning import build_work
 
@@ -145,17 +145,17 @@ def at_bounds(scenario: Scenario, after: Scenario, knobs: Mapping[str, Knob]) ->
 
 
 def describe_instability(after: Scenario) -> str:
-    """Return what is not stable in the linearised loop, here and at the corners of [design.over].
+    """Return what is not stable in the linearised loop, here and at points of the box of [design.over].
 
     The text is empty if all is stable, and if the loop has no linear model.
     """
     try:
-        loop = linear_stability(after, linearise_corners(after))
+        loop = linear_stability(after, linearise_box(after))
     except ValueError:
         return ""
     lost = [] if loop.stable else ["the loop is not stable"]
-    if loop.corners.unstable:
-        lost.append(f"{loop.corners.unstable} of {loop.corners.systems} corners of [design.over] are not stable")
+    if loop.box.unstable:
+        lost.append(f"{loop.box.unstable} of {loop.box.systems} points of [design.over] are not stable")
     return "; ".join(lost)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from diffabs.linear.opened_loop import OpenLoop
-from diffabs.linear.robustness import frequencies
+from diffabs.linear.robustness import frequencies, sensitivity_gains, shape_bound
 from diffabs.linear.stability_margins import Margins
 from diffabs.output.plot.style import COLOURS, GREY, Sheet, curve_style, label_axes, make_logarithmic, sheet
 
@@ -64,18 +64,13 @@ def draw_sensitivities(
     """
     w = frequencies([loop for loops in boxes.values() for loop in loops])
     for i, (name, loops) in enumerate(boxes.items()):
-        opened = np.array([loop.transfer().response(w) for loop in loops])
-        identity = np.eye(opened.shape[-1])
-        closed = np.linalg.inv(identity + opened)
-        for ax, values in ((sensitivity, closed), (complementary, identity - closed)):
-            _draw_range(ax, w, np.linalg.norm(values, 2, axis=(2, 3)), name, i)
+        for ax, values in zip((sensitivity, complementary), sensitivity_gains(loops, w), strict=True):
+            _draw_range(ax, w, values, name, i)
     for ax, bound in ((sensitivity, bounds.sensitivity), (complementary, bounds.complementary)):
         if bound is not None:
             ax.axhline(bound, color=GREY, linewidth=1.2, linestyle=":", label=f"bound {bound:g}")
     if bounds.shape:
-        at, limits = np.array(bounds.shape).T
-        shown = np.exp(np.interp(np.log(w), np.log(at), np.log(limits)))
-        sensitivity.plot(w, shown, color=GREY, linewidth=1.2, linestyle=":", label="shape")
+        sensitivity.plot(w, shape_bound(bounds.shape, w), color=GREY, linewidth=1.2, linestyle=":", label="shape")
     for ax, name in ((sensitivity, "|S|"), (complementary, "|T|")):
         make_logarithmic(ax, "x")
         ax.set_xlim(w[0], w[-1])
