@@ -765,11 +765,11 @@ def test_the_chart_of_sensitivities_is_in_decibels():
 
 @killed_by("linear.robustness", "np.exp(np.interp(np.log(w), at, limits))", "np.interp(w, *np.array(shape).T)")
 def test_the_goal_of_sensitivity_is_the_lower_bound(file):
-    constraints = "[tune.constraints]\nsensitivity = 2.0\nshape = [[1.0, 0.1], [100.0, 10.0]]\n"
+    constraints = "[tune.constraints]\nsensitivity = 2.0\nshape = [[1.0, 0.1], [100.0, 4.0]]\n"
     now = Session(str(file(SHORT + constraints))).scenario()
     w = np.array([0.1, 1.0, 10.0, 100.0])
     curve = stability.find_sensitivity_goal(now, w)
-    np.testing.assert_allclose(curve, [0.1, 0.1, 1.0, 2.0])
+    np.testing.assert_allclose(curve, [0.1, 0.1, math.sqrt(0.4), 2.0])
 
 
 @killed_by("output.explore.charts", "third - quarter, high - third", "third - quarter, high - low")
