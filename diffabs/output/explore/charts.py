@@ -193,7 +193,7 @@ def sensitivity_chart() -> JsonObject:
 
 def change_sensitivity(here: SensitivityCurve, box: SensitivityRange) -> JsonObject:
     """Return the change of the chart that shows |S| of a loop, its goal, and the range over the box."""
-    low, high, line, goal = (_to_db(gain) for gain in (box.least, box.greatest, here.gain, here.goal))
+    low, high, line, goal = (_to_db(gain) for gain in (box.low, box.high, here.gain, here.goal))
     w = np.concatenate([here.w, box.w])
     shown = np.concatenate([low, high, line, goal])
     shown = shown[np.isfinite(shown)]

@@ -23,11 +23,11 @@ MARGIN_KEYS = ("gain_up", "gain_down", "phase", "delay", "modulus")
 
 
 class SensitivityRange(NamedTuple):
-    """Least and greatest |S| [1] of some loops at frequencies w [rad/s]; empty if a loop is unstable."""
+    """Least (`low`) and greatest (`high`) |S| [1] of some loops at frequencies w [rad/s]; empty if one is unstable."""
 
     w: np.ndarray
-    least: np.ndarray
-    greatest: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
 
 
 NO_RANGE = SensitivityRange(*np.empty((3, 0)))
