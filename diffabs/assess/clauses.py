@@ -3,7 +3,9 @@
     z = 0.849/t        braking rate of the car from 45 to 15 km/h in t seconds (30/3.6/9.81 = 0.849)
     epsilon = z/k      utilised adhesion; the surfaces give k exactly, where a test house measures it with one axle
 
-Two figures of the split road, z >= 0.75 (4 kL + kH)/5 and z >= kL, stand in no text that was read: they are marked.
+Three figures of the split road stand in no text that was read, and are marked: z >= 0.75 (4 kL + kH)/5, z >= kL, and
+the lateral position. Its limit is ours: half of the room that a lane of 3.5 m leaves a car of 1.75 m. Without it a car
+that nobody steers would meet 5.3.7.
 """
 
 import dataclasses
@@ -21,6 +23,7 @@ from diffabs.parts.plants import GRAVITY
 from diffabs.uncertainty.sweep.statistics.estimates import Count, IntervalEstimate
 
 RATE = 30 * ONE_KMH / GRAVITY  # s, braking rate times the time from 45 to 15 km/h
+LANE_ROOM = (3.5 - 1.75) / 2  # m
 SLOWEST = 2.0  # times the shortest time of the longest stop: a slower run does not stop
 PROGRAM_RANGES = {
     "high": (0.5, 1.5, ""),
@@ -144,7 +147,7 @@ def assess(
         >>> from diffabs.scenario import load
         >>> assess(load("slip-lmi").loop, d.Adaptive(1e-5, 20.0))
         Traceback (most recent call last):
-        ValueError: MirroredRig has no tyres on roads of their own; HalfCar and Car have them
+        ValueError: MirroredRig has no tyres with roads; the plants half-car and car have them
     """
     program, population = program or StopProgram(), population or {}
     check_program(program)
@@ -199,6 +202,7 @@ def clause_figures(runs: Run, stops: list[RuleStop], program: StopProgram) -> li
         row("5.3.7", "steering wheel, in all", "split", whole, 240.0, "deg"),
         row("", "split: rate, 0.75 (4 kL + kH)/5", "split", rate, fair, "1", at_least=True)._replace(confirmed=False),
         row("", "split: rate, kL", "split", rate, program.low, "1", at_least=True)._replace(confirmed=False),
+        row("", "split: lateral position", "split", metrics["lateral"], LANE_ROOM, "m")._replace(confirmed=False),
     ]
 
 

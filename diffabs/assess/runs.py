@@ -83,7 +83,7 @@ def tyre_fields(plant: Part) -> tuple[str, ...]:
     """Return the names of a plant's tyres. Raises ValueError for a plant without any."""
     names = tuple(name for name in vars(plant) if name.endswith("_tyre"))
     if not names:
-        raise ValueError(f"{type(plant).__name__} has no tyres on roads of their own; HalfCar and Car have them")
+        raise ValueError(f"{type(plant).__name__} has no tyres with roads; the plants half-car and car have them")
     return names
 
 
@@ -152,7 +152,11 @@ def _objectives(plant: Part, program: StopProgram) -> dict[str, Objective]:
         f"locked_{slip}": InChannel(objective=LockedTime(), control=f"{slip.removesuffix('_slip')}_brake", output=slip)
         for slip in plant.shows.tracked
     }
-    steered = {"steer": PeakOutput(output="steer"), "early_steer": PeakOutput(output="steer", until=SOON)}
+    steered: dict[str, Objective] = {
+        "steer": PeakOutput(output="steer"),
+        "early_steer": PeakOutput(output="steer", until=SOON),
+        "lateral": PeakOutput(output="lateral_position"),
+    }
     return {
         "time": TimeBetweenSpeeds(fast=45 * ONE_KMH, slow=15 * ONE_KMH),
         "rise_time": RiseTime(place=UP_EDGE, deceleration=0.75 * program.high * GRAVITY),

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from diffabs.assess import Assessment
 
 MOST_CARS = 1_000_000
-UNCONFIRMED = "Rules without a number stand in no text that was read; the conclusion leaves them out."
+UNCONFIRMED = "Rules without a clause number are not from the regulation; the exit status does not depend on them."
+ONE_TRACK = "5.3.4 and 5.3.7, the split road, need the plant car: a half-car has one track."
 
 
 def assess_brakes(
@@ -73,6 +74,8 @@ def _show_assessment(result: JsonObject, assessment: "Assessment", scenario: Sce
     tables.show_titled_table(f"{scenario.title or scenario.name}: {assessment.stops} stops", table)
     if any(not row.confirmed for row in assessment.clauses):
         console.say(UNCONFIRMED)
+    else:
+        console.say(ONE_TRACK)
     if assessment.unfinished:
         console.say(
             f"warning: {assessment.unfinished:,} runs diverged or did not reach 15 km/h; their cars do not pass"

@@ -62,7 +62,8 @@ class Simulation(NamedTuple):
         if self.at_limit > WARNED_LIMIT_SHARE:
             limits, units = at_limits(scenario.loop), control_units(scenario.loop.plant)
             each = zip(units.items(), np.ravel(limits.low), np.ravel(limits.high), strict=True)
-            named = [(f"{name} " if len(units) > 1 else "", unit, low, high) for (name, unit), low, high in each]
+            bounded = [row for row in each if np.isfinite(row[1:]).any()]
+            named = [(f"{name} " if len(units) > 1 else "", unit, low, high) for (name, unit), low, high in bounded]
             ends = ", ".join(f"{name}{low:g} to {high:g} {unit}" for name, unit, low, high in named)
             share = f"{100 * self.at_limit:.0f} % of the run"
             yield f"the control is at a limit ({ends}) for {share}: gains hardly matter there"

@@ -49,7 +49,14 @@ def test_each_clause_has_stops_of_both_loads():
 def pretended_runs(cars, **metrics):
     """Runs of a car in which each metric has one value."""
     stops = plan_stops(Car(), Program())
-    usual = {"time": 1.2, "rise_time": 0.3, "locked_slip": 0.0, "steer": 0.1, "early_steer": 0.05} | metrics
+    usual = {
+        "time": 1.2,
+        "rise_time": 0.3,
+        "locked_slip": 0.0,
+        "steer": 0.1,
+        "early_steer": 0.05,
+        "lateral": 1.0,
+    } | metrics
     values = {name: jnp.full(cars * len(stops), value) for name, value in usual.items()}
     return SimpleNamespace(metrics=values), stops
 
@@ -65,8 +72,8 @@ def test_figures_are_those_of_the_formulas():
     np.testing.assert_allclose(used, [[z / 0.8, z / 0.3] * 2] * 2, rtol=1e-12)
     steered = [np.asarray(row.values) for (number, _), row in rows.items() if number == "5.3.7"]
     np.testing.assert_allclose(steered, [[[45.8366] * 2] * 2, [[91.6732] * 2] * 2], rtol=1e-5)
-    assert [row.limit for row in rows.values()][-2:] == pytest.approx([0.3, 0.3])  # 0.75 (4 0.3 + 0.8)/5
-    assert sum(not row.confirmed for row in rows.values()) == 2
+    assert [row.limit for row in rows.values()][-3:] == pytest.approx([0.3, 0.3, 0.875])  # 0.75 (4 0.3 + 0.8)/5
+    assert sum(not row.confirmed for row in rows.values()) == 3
 
 
 @pytest.mark.slow
@@ -145,7 +152,7 @@ def test_an_impossible_program_is_refused(change, line):
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["slip-lmi"], "MirroredRig has no tyres on roads of their own; HalfCar and Car have them"),
+        (["slip-lmi"], "MirroredRig has no tyres with roads; the plants half-car and car have them"),
         (["half-car", "--brief", "-1"], "brief = -1 is outside [0, 10] s"),
         (["half-car", "--cars", "5"], "sweep.over is empty"),
     ],

@@ -337,3 +337,26 @@ def test_derivatives_of_a_run_are_those_of_differences():
         )
         difference = (8 * (close - near) - (distant - far)).T / (12 * width * np.asarray(x))
         np.testing.assert_allclose(derivative, difference, rtol=tolerance, atol=1e-5 * np.abs(difference).max())
+
+
+@killed_by("parts.plants.car", "+ downhill * jnp.sin(state.yaw)", "- downhill * jnp.sin(state.yaw)")
+@killed_by("parts.plants.half_car", "+ GRAVITY * jnp.sin(self.incline)", "- GRAVITY * jnp.sin(self.incline)")
+def test_gravity_acts_downhill_on_a_slope():
+    """Without tyre forces and drag: g sin(slope) against the x axis of the road, and loads of m g cos(slope)."""
+    slope, yaw, speed = 0.12, 0.3, 15.0
+    smooth = with_tyres(roads.RoadTyre(road=roads.Scaled(road=roads.SNOW, scale=1e-9)))
+    car = Car(incline=slope, **smooth)
+    state = car.start(BrakeStart(speed=speed))._replace(yaw=yaw)
+    rate, y = rates(car, state, CarControls(*[0.0] * 5)), shown(car, state)
+    acceleration = np.array([rate.longitudinal_velocity, rate.lateral_velocity])
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    np.testing.assert_allclose(turn @ acceleration, [-GRAVITY * np.sin(slope), 0.0], atol=1e-6)
+    loads = [y.front_left_load, y.front_right_load, y.rear_left_load, y.rear_right_load]
+    np.testing.assert_allclose(sum(loads), car.mass * GRAVITY * np.cos(slope), rtol=1e-12)
+
+    half = HalfCar(
+        incline=slope, rolling=0.01, front_tyre=smooth["front_left_tyre"], rear_tyre=smooth["rear_left_tyre"]
+    )
+    rolling = half.derivative(0.0, HalfCarState(speed, speed / 0.344, speed / 0.344, 0.0), AxleBrakes(0.0, 0.0))
+    expected = -GRAVITY * (np.sin(slope) + 0.01 * np.cos(slope))
+    np.testing.assert_allclose(rolling.speed, expected, rtol=1e-6)

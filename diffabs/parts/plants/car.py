@@ -14,8 +14,9 @@ for the left (-) and the right (+) wheel; k is the front axle's share of the rol
 no load. Forces and loads are solved together: for tyres with F = Fz mu and four loaded wheels X and Y are the solution
 of two linear equations.
 
-The front wheels follow the demanded steer angle with a lag. The model is for forward motion (u > 0) on a level road.
-Suspension and roll have no dynamics.
+The front wheels follow the demanded steer angle with a lag. The road may rise along the x axis: g cos(incline) is then
+in the place of g, and g sin(incline) acts downhill. The model is for forward motion (u > 0). Suspension and roll have
+no dynamics.
 
 Source: R. Rajamani, Vehicle Dynamics and Control, 2nd ed., sec. 8.3; the default numbers are vehicle 2 (BMW 320i) of M.
 Althoff and G. Wuersching, CommonRoad: Vehicle Models, 2020, with half of its axle's inertia for each wheel.
@@ -210,6 +211,8 @@ class Car(SlipProbes):
     """Time constant of the steering."""
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
     """Least denominator of the slip."""
+    incline: Scalar = param(default=0.0, unit="rad", above=-0.7, below=0.7)
+    """Angle of the road to the horizontal, positive uphill along the x axis."""
     commanded: bool = static(default=False)
     """True for loads by the deceleration that the brakes demand."""
     front_left_tyre: Tyre = part(default=RoadTyre)
@@ -340,7 +343,7 @@ class Car(SlipProbes):
 
     def _load_terms(self) -> tuple[tuple[Scalar, Scalar, Scalar], ...]:
         """Return the load of each wheel at rest [N], and how much X and Y add to it [N/N]."""
-        weight, wheelbase = self.mass * GRAVITY, 2 * (self.to_front + self.to_rear)
+        weight, wheelbase = self.mass * GRAVITY * jnp.cos(self.incline), 2 * (self.to_front + self.to_rear)
         front, rear, pitch = (
             weight * self.to_rear / wheelbase,
             weight * self.to_front / wheelbase,
@@ -418,14 +421,17 @@ class Car(SlipProbes):
         )
 
     def _rolling_force(self, state: CarState) -> Scalar:
-        """Return f m g while the car moves."""
+        """Return f m g cos(incline) while the car moves."""
         moves = jnp.greater(state.longitudinal_velocity, 0)
-        return self.rolling * self.mass * GRAVITY * jnp.where(moves, 1.0, 0.0)
+        return self.rolling * self.mass * GRAVITY * jnp.cos(self.incline) * jnp.where(moves, 1.0, 0.0)
 
     def _accelerations(self, state: CarState, road: CarForces) -> tuple[Scalar, Scalar]:
         """Return the accelerations along and across the car's heading."""
-        drag = self.drag * state.longitudinal_velocity**2
-        return quotient(road.longitudinal - drag, self.mass), quotient(road.lateral, self.mass)
+        drag, downhill = self.drag * state.longitudinal_velocity**2, GRAVITY * jnp.sin(self.incline)
+        return (
+            quotient(road.longitudinal - drag, self.mass) - downhill * jnp.cos(state.yaw),
+            quotient(road.lateral, self.mass) + downhill * jnp.sin(state.yaw),
+        )
 
     def _solve_loads(self, forces_of_loads: list[ForceOfLoad], state: CarState) -> Wheels:
         """Return the loads that belong to the forces that they cause, by Newton's steps from X = Y = 0."""

@@ -3,6 +3,8 @@
     m v' = -X - c v^2,   X = F1 + F2 + f m g,   J1 w1' = r F1 - u1,   J2 w2' = r F2 - u2,   x' = v
     Fz1 = (m g b + h X)/(a + b),   Fz2 = (m g a - h X)/(a + b)
 
+On an incline the loads have g cos(incline) in place of g, and v' falls by g sin(incline).
+
 X is the road's whole force against the motion. It acts at the ground and the air drag at the centre of gravity, so X
 alone shifts the load. Forces depend on loads and loads on forces. For tyres with F = Fz mu(slip) the loop is linear in
 X; one Newton step from X = 0 is its solution. Other tyres need two further steps for all digits.
@@ -149,6 +151,8 @@ class HalfCar(SlipProbes):
     """Coefficient f of rolling resistance."""
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
     """Least denominator of the slip."""
+    incline: Scalar = param(default=0.0, unit="rad", above=-0.7, below=0.7)
+    """Angle of the road to the horizontal, positive uphill."""
     commanded: bool = static(default=False)
     """True for loads by the deceleration that the brakes demand."""
     front_tyre: Tyre = part(default=RoadTyre)
@@ -216,7 +220,7 @@ class HalfCar(SlipProbes):
     def loads(self, force: Scalar) -> Axles:
         """Return the vertical forces of the axles [N] under the road's whole force against the motion [N]."""
         wheelbase = self.to_front + self.to_rear
-        weight, shift = self.mass * GRAVITY, self.height * force
+        weight, shift = self.mass * GRAVITY * jnp.cos(self.incline), self.height * force
         return Axles(
             (weight * self.to_rear + shift) / wheelbase,
             (weight * self.to_front - shift) / wheelbase,
@@ -268,8 +272,9 @@ class HalfCar(SlipProbes):
         return self._forces(self._slips(state), self._places(state.distance), state.speed, loads)
 
     def _rolling_force(self, speed: Scalar) -> Scalar:
-        """Return f m g while the car moves."""
-        return self.rolling * self.mass * GRAVITY * jnp.where(jnp.greater(speed, 0), 1.0, 0.0)
+        """Return f m g cos(incline) while the car moves."""
+        moves = jnp.where(jnp.greater(speed, 0), 1.0, 0.0)
+        return self.rolling * self.mass * GRAVITY * jnp.cos(self.incline) * moves
 
     def _braking_force(self, state: HalfCarState) -> Scalar:
         """Return the road's whole force X in a state."""
@@ -286,7 +291,7 @@ class HalfCar(SlipProbes):
         return _newton_root(excess, 0.0 * speed, 1 if proportional else LOAD_STEPS)
 
     def _deceleration(self, speed: Scalar, force: Scalar) -> Scalar:
-        return quotient(force + self.drag * speed * speed, self.mass)
+        return quotient(force + self.drag * speed * speed, self.mass) + GRAVITY * jnp.sin(self.incline)
 
 
 def _newton_root(function: Callable[[Scalar], Scalar], start: Scalar, steps: int) -> Scalar:
