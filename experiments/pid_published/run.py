@@ -10,7 +10,7 @@ rules SIMC and AMIGO are compared as printed, and with all gains times a factor 
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -21,6 +21,7 @@ from experiments._shared.numbers import store_numbers
 from experiments.pid_published import models, scan, search
 from experiments.pid_published.models import Gains, Process, StepFit
 
+SAME = 1e-3  # relative distance of ki below which two searches agree
 RULES = {"SIMC PI": models.simc_pi, "AMIGO PI": models.amigo_pi, "AMIGO PID": models.amigo_pid}
 
 
@@ -67,26 +68,59 @@ class Task:
         return [Gains(g.k, g.ki * scale, g.kd / scale) for g, scale in zip(gains, scales, strict=True)]
 
 
-def search_all(config: Config, task: Task, guesses: Sequence[Gains], size: int) -> search.Search:
-    """Return the gains of the greatest ki for each model, in seconds, with peaks that NumPy confirms.
+class Best(NamedTuple):
+    """The best of the searches from several starts.
+
+    Attributes:
+        gains: Gains of each model, in seconds.
+        evaluations: Evaluations of each model, of all its starts.
+        agreeing: Number of starts of each model that end at the same ki.
+    """
+
+    gains: list[Gains]
+    evaluations: np.ndarray
+    agreeing: np.ndarray
+
+
+def search_best(task: Task, starts: Sequence[Sequence[Gains]], bounds: np.ndarray, size: int) -> Best:
+    """Return the greatest ki of each model over some starts, each a list of gains for all models."""
+    models_of_all = Task.of(list(task.processes) * len(starts))
+    result = models_of_all.search([gains for start in starts for gains in start], np.tile(bounds, len(starts)), size)
+    ki = np.array([gains.ki for gains in result.gains]).reshape(len(starts), -1)
+    count, winners = ki.shape[1], ki.argmax(axis=0)
+    gains = [result.gains[winner * count + i] for i, winner in enumerate(winners)]
+    agreeing = np.sum(ki >= (1 - SAME) * ki.max(axis=0), axis=0)
+    return Best(gains, result.evaluations.reshape(len(starts), -1).sum(axis=0), agreeing)
+
+
+def search_all(config: Config, task: Task, starts: Sequence[Sequence[Gains]], size: int) -> Best:
+    """Return the gains of the greatest ki for each model, with peaks that NumPy confirms.
 
     If a delay is much longer than the lags, |S| of a PID loop has tens of nearly equal peaks. The frequencies of the
     search may miss the highest by a thousandth. The search is repeated with a bound that is as much lower.
     """
-    bounds = np.full(len(guesses), config.peak)
-    gains, evaluations = task.search(guesses, bounds, size)
+    bounds = np.full(len(task.processes), config.peak)
+    best = search_best(task, starts, bounds, size)
     for _ in range(config.repetitions):
-        measured = task.measure(gains)
+        measured = task.measure(best.gains)
         beyond = np.flatnonzero(measured > config.peak * (1 + config.excess))
         if not beyond.size:
             break
         bounds[beyond] *= config.peak / measured[beyond]
         rest = Task.of([task.processes[i] for i in beyond])
-        again = rest.search([guesses[i] for i in beyond], bounds[beyond], size)
-        evaluations[beyond] += again.evaluations
-        for i, better in zip(beyond, again.gains, strict=True):
-            gains[i] = better
-    return search.Search(gains, evaluations)
+        again = search_best(rest, [[start[i] for i in beyond] for start in starts], bounds[beyond], size)
+        best.evaluations[beyond] += again.evaluations
+        best.agreeing[beyond] = again.agreeing
+        for i, gains in zip(beyond, again.gains, strict=True):
+            best.gains[i] = gains
+    return best
+
+
+def list_pid_starts(fit: StepFit) -> tuple[Gains, ...]:
+    """Return the starts of a PID search: AMIGO's gains, with less integral, more derivative, and nearly PI."""
+    pid, pi = models.amigo_pid(fit), models.amigo_pi(fit)
+    fast = Gains(pid.k, 0.5 * pid.ki, 2 * pid.kd)
+    return pid, pid._replace(ki=0.3 * pid.ki), fast, Gains(pi.k, pi.ki, 0.3 * pid.kd)
 
 
 def judge_rule(config: Config, process: Process, fit: StepFit, name: str) -> tuple[dict[str, Any], Gains | None]:
@@ -167,12 +201,13 @@ def main(config: Config | None = None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config = config or Config()
     task = Task.of(list(models.list_models())[:: config.every])
-    pi = search_all(config, task, [models.amigo_pi(fit) for fit in task.fits], 2)
-    guesses = [models.amigo_pid(fit) for fit in task.fits]
-    pid = search_all(config, task, guesses, 3)
+    pi = search_all(config, task, [[models.amigo_pi(fit) for fit in task.fits]], 2)
+    pid = search_all(config, task, list(zip(*map(list_pid_starts, task.fits), strict=True)), 3)
     print(f"searched {len(task.processes)} models", flush=True)
     columns = zip(task.processes, task.fits, pi.gains, pid.gains, strict=True)
     rows = [compare_model(config, *column) for column in columns]
+    for row, agreeing in zip(rows, pid.agreeing.tolist(), strict=True):
+        row["PID: starts that agree"] = agreeing
     table = summarise(rows)
     record.print_rows("Integral gains at equal peaks", table)
     results = {
@@ -183,6 +218,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
             "PI: most evaluations": int(pi.evaluations.max()),
             "PID: median evaluations": float(np.median(pid.evaluations)),
             "PID: most evaluations": int(pid.evaluations.max()),
+            "PID: models with two agreeing starts": int(np.sum(pid.agreeing > 1)),
             "PI: greatest peak": float(task.measure(pi.gains).max()),
             "PID: greatest peak": float(task.measure(pid.gains).max()),
         },

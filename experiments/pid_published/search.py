@@ -20,7 +20,7 @@ from diffabs.linear.responses.response import TracedSystem
 from experiments.pid_published.models import Gains, Process
 
 ORDER = 8  # greatest of a model
-BARRIERS = (0.1, 1e-5)  # mu of the first and of the last centre
+BARRIERS = (1.0, 1e-5)  # mu of the first and of the last centre
 CENTRED = 0.01  # of mu: expected decrease of the function below which mu falls
 MAX_ROUNDS = 400
 MIN_CURVATURE = 1e-9
