@@ -172,9 +172,8 @@ class Loop(LoopParts):
 
     def least_scales(self, state: LoopState) -> tuple[PyTree, ...] | None:
         """Return the plant's least scales, with zeros for the blocks; None if the plant has none."""
-        if not hasattr(self.plant, "least_scales"):
-            return None
-        return self.plant.least_scales(), *jax.tree.map(jnp.zeros_like, state.flow()[1:])
+        least_scales = getattr(self.plant, "least_scales", None)
+        return least_scales and (least_scales(), *jax.tree.map(jnp.zeros_like, state.flow()[1:]))
 
     @property
     def changes(self) -> bool:

@@ -101,7 +101,7 @@ def draw_cars(config: Config) -> dict[str, np.ndarray]:
 
 def shortest(stop: RuleStop, program: StopProgram) -> float:
     """Return the shortest distance from the speed of a stop to 15 km/h on one surface [m]."""
-    adhesion = program.low if stop.left_side[0] else program.high
+    adhesion = float(program.low if stop.left_side[0] else program.high)
     return ((stop.speed * KMH) ** 2 - (END * KMH) ** 2) / (2 * GRAVITY * adhesion)
 
 
