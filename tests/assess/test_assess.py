@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import parts
 import pytest
 from commands import assert_one_error_line, run
 from mutants import killed_by
@@ -18,6 +19,7 @@ from diffabs.assess import assess, clause_figures, make_surface, peak_friction
 from diffabs.assess.clauses import check_program
 from diffabs.assess.runs import plan_stops, run_stops
 from diffabs.core.pytree import replace
+from diffabs.parts.objectives import RiseTime
 from diffabs.parts.plants import GRAVITY, Car, HalfCar
 from diffabs.scenario import load
 
@@ -132,6 +134,21 @@ def test_the_half_car_meets_all_clauses_and_its_gains_have_slopes():
             difference = (8 * (close - near) - (distant - far)) / (12 * step[i])
             np.testing.assert_allclose(slopes[:, i], difference, rtol=1e-3, atol=1e-4 * np.abs(difference).max())
     assert assess(scenario.loop, scenario.solver).passed == 1
+
+
+@killed_by("parts.objectives.braking", "larger(end - begin, 0.0)", "end")
+@pytest.mark.parametrize(("place", "limit"), [(1.0, 5.0), (1.0, 4.97), (0.0, 3.0), (1.0, 2.1), (1.0, 9.0)])
+def test_a_rise_counts_from_its_place(place, limit):
+    """The deceleration 2 + 10 t reaches the limit at (limit - 2)/10, the car the place where 20 t - 4 t^2 = place."""
+
+    def sample_at(t):
+        sample = parts.braking_at(t)
+        return sample._replace(output=sample.output._replace(deceleration=2.0 + 10.0 * t))
+
+    value = parts.objective_run(RiseTime(place=place, deceleration=limit), sample_at)
+    passed = (20 - np.sqrt(400 - 16 * place)) / 8
+    expected = max((limit - 2) / 10 - passed, 0.0) if limit < 7 else np.inf
+    np.testing.assert_allclose(value, expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -214,6 +214,9 @@ PARTS: dict[str, dict[str, Any]] = {
         "effort": objectives.Effort(),
         "torque rate": objectives.TorqueRate(),
         "variation": objectives.Variation(),
+        "peak output": objectives.PeakOutput(output="distance", until=0.1995),
+        "time between speeds": objectives.TimeBetweenSpeeds(fast=19.0, slow=18.0),
+        "rise time": objectives.RiseTime(place=0.05, deceleration=7.0),
         **{f"balance: {name}": part for name, part in objectives.BALANCE.items()},
         "balance: soft loss": objectives.SoftLoss(weight=np.arange(1.0, 7.0), radius=0.05, softness=0.7),
         "balance: cost": objectives.BalanceCost(q=np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), r=0.5),
@@ -233,6 +236,7 @@ WITH_CHANNELS: dict[str, dict[str, Any]] = {
         "per channel": controllers.PerChannel({"pump_1": _PID, "pump_2": controllers.Relay()}, TANK),
         "per channel, one": controllers.PerChannel(_PID, TANK),
         "select low": controllers.SelectLow(controller=controllers.PerChannel(_PID, TANK), groups=(tuple(TANK),)),
+        "hold course": controllers.HoldCourse(controller=controllers.PerChannel(_PID, TANK), gain=0.05),
         "matrix feedback": controllers.MatrixFeedback(
             gain=-np.arange(1.0, 13.0).reshape(2, 6),
             outputs_at_rest=np.full(4, 0.1),
@@ -446,6 +450,9 @@ VALUES = {  # of the objectives on those runs, by hand
     "balance: cost": SQUARES @ np.arange(1.0, 7.0) * T / 2 * (1 - E**2)
     + 0.5 * (25 * 0.5 + 200 * T * (1 - E) + 400 * T / 2 * (1 - E**2)),
     "torque rate": 4.0 / T,  # at the start
+    "peak output": 20 * 0.2 - 4 * 0.2**2,  # the last step that begins before 0.1995 s ends at 0.2 s
+    "time between speeds": 1.0 / 8.0,
+    "rise time": 0.0,  # the deceleration is 8 m/s^2 throughout
 }
 
 
