@@ -140,17 +140,20 @@ class FivePhase:
     def _follow_phase(self, phase: Scalar, acceleration: Scalar, slip: Scalar) -> Scalar:
         """Return the phase after a tick."""
         brakes, recovers = acceleration < -self.braking_threshold, acceleration > self.recovery_threshold
-        locks = slip > self.slip_high
+        rolls, locks = jnp.logical_not(brakes), slip > self.slip_high
         ways: dict[BrakePhase, list[tuple[BrakePhase, PyTree]]] = {
             BrakePhase.BUILD: [(BrakePhase.HOLD, brakes)],
-            BrakePhase.HOLD: [(BrakePhase.DUMP, slip > self.slip_low), (BrakePhase.SLOW_BUILD, ~brakes)],
-            BrakePhase.DUMP: [(BrakePhase.RECOVER, recovers), (BrakePhase.WAIT, ~brakes & ~locks)],
+            BrakePhase.HOLD: [
+                (BrakePhase.DUMP, slip > self.slip_low),
+                (BrakePhase.SLOW_BUILD, rolls),
+            ],
+            BrakePhase.DUMP: [(BrakePhase.RECOVER, recovers), (BrakePhase.WAIT, jnp.logical_not(brakes | locks))],
             BrakePhase.WAIT: [
                 (BrakePhase.DUMP, brakes | locks),
                 (BrakePhase.RECOVER, recovers),
                 (BrakePhase.SLOW_BUILD, slip < self.slip_low),
             ],
-            BrakePhase.RECOVER: [(BrakePhase.SLOW_BUILD, ~recovers)],
+            BrakePhase.RECOVER: [(BrakePhase.SLOW_BUILD, jnp.logical_not(recovers))],
             BrakePhase.SLOW_BUILD: [(BrakePhase.DUMP, brakes)],
         }
         following = phase
