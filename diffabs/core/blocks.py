@@ -223,6 +223,14 @@ class Parallel:
             yield name, block, Memory(memory.flow[name], memory.held[name])
 
 
+def find_unnamed(field: str, blocks: object, example: str) -> Iterator[str]:
+    """Yield a line if a field of blocks by name has none, or a block without a name."""
+    if not isinstance(blocks, Mapping):
+        yield f"{field} = {type(blocks).__name__} has no name; a table by name is needed, such as {example}"
+    elif not blocks:
+        yield f"{field} = {{}} is empty; a table by name is needed, such as {example}"
+
+
 class ChangedCommand(Chain):
     """Base of a controller that changes the commands of another one, its part `controller`.
 

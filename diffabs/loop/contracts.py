@@ -7,6 +7,7 @@ optional methods, only those of ticks and events are traced.
 """
 
 import dataclasses
+import operator
 import pathlib
 import sysconfig
 import traceback
@@ -21,7 +22,7 @@ from diffabs.core import kinds
 from diffabs.core.blocks import Parallel, offers
 from diffabs.core.channels import has_channels
 from diffabs.core.protocols import Clock, Ending, Memory, Objective, Sample, Tracking, resting_segment
-from diffabs.core.pytree import canonical_dtypes, stack_lists
+from diffabs.core.pytree import canonical_dtypes, children, stack_lists
 from diffabs.host.values import kebab_case
 from diffabs.loop.closed_loop import Loop
 
@@ -73,10 +74,8 @@ def find_misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[st
         for path, objective in objectives.items():
             try:
                 _follow_objective(path, objective, sample, ending)
-            except Misfit as error:
+            except (Misfit, ValueError) as error:
                 lines.append(str(error))
-            except ValueError as error:
-                lines.append(f"{path}: {error}")
 
     jax.eval_shape(trace, *canonical_dtypes((stack_lists(loop), dict(objectives))))
     yield from lines
@@ -161,7 +160,7 @@ def _follow_objective(path: str, objective: Objective, sample: Sample, ending: E
 def _call(path: str, part: object, method: str, *args: object) -> Any:
     """Return the result of a method, or raise a Misfit with the reason why it fails.
 
-    A ValueError of a packaged part is its message to the user, and is raised again unchanged.
+    A ValueError of a packaged part is its message to the user, and is raised again with the path of that part.
     """
     function: Callable[..., Any] | None = getattr(part, method, None)
     if not callable(function):
@@ -173,7 +172,7 @@ def _call(path: str, part: object, method: str, *args: object) -> Any:
     except Exception as error:
         place = _place(error)
         if isinstance(error, ValueError) and not place:
-            raise
+            raise ValueError(_prefix_field(path, part, error)) from error
         if isinstance(error, WITHOUT_VALUE):
             why = (
                 " needs a number's value, which JAX traces without; use jnp.where for if, jax.numpy for math and numpy"
@@ -187,8 +186,7 @@ def _call(path: str, part: object, method: str, *args: object) -> Any:
 
 def _explain_missing(path: str, part: object, method: str, error: AttributeError) -> str:
     """Return a line about a missing attribute: which part reads it, and which fields exist."""
-    frames = [frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__)]
-    reader = ([frame_self for frame_self in frames if dataclasses.is_dataclass(frame_self)] or [part])[-1]
+    reader = next(_active_parts(error), part)
     fields = getattr(error.obj, "_fields", None)
     if fields is None and dataclasses.is_dataclass(error.obj):
         fields = [field.name for field in dataclasses.fields(error.obj)]
@@ -196,6 +194,32 @@ def _explain_missing(path: str, part: object, method: str, error: AttributeError
         return f"{path}.{method} fails: {next(iter(str(error).splitlines()), '')}"
     needs = f"{path}: {kebab_case(type(reader).__name__)} needs {error.name}"
     return f"{needs}; there is only {', '.join(fields)}: these parts do not fit together"
+
+
+def _prefix_field(path: str, part: object, error: ValueError) -> str:
+    """Return the message of a packaged part, which may begin with one of its fields, after the part's path."""
+    message, root = str(error), path.partition(".")[0]
+    if message.startswith(root):
+        return message
+    places = ((_find_path(active, part, path), active) for active in _active_parts(error))
+    where, reader = next(filter(operator.itemgetter(0), places), (path, part))
+    fields = [field.name for field in dataclasses.fields(reader)] if dataclasses.is_dataclass(reader) else []
+    begins_with_field = message.partition(":")[0].partition(" ")[0] in fields
+    return f"{where}.{message}" if begins_with_field else f"{where}: {message}"
+
+
+def _active_parts(error: Exception) -> Iterator[Any]:
+    """Yield the parts whose methods the error passed, the innermost first."""
+    frames = [frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return (part for part in reversed(frames) if dataclasses.is_dataclass(part))
+
+
+def _find_path(inner: object, part: object, path: str) -> str:
+    """Return the path of a part that is `part` or inside it; empty if it is not."""
+    if inner is part:
+        return path
+    inside = (_find_path(inner, value, name) for name, _, value in children(part, f"{path}."))
+    return next(filter(None, inside), "")
 
 
 def _place(error: Exception) -> str:

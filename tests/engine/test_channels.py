@@ -527,6 +527,28 @@ MISFITS = {
         },
         "groups: left is one name; lists of names are needed",
     ),
+    "a group that is empty": (
+        {"controller": controllers.SelectLow(controller=controllers.PerChannel(PIDS, CHANNELS), groups=((),))},
+        "controller.groups: a group is empty; lists of names are needed",
+    ),
+    "a group of an unknown control": (
+        {
+            "controller": Difference(
+                controller=controllers.SelectLow(
+                    controller=controllers.PerChannel(PIDS, CHANNELS), groups=(("left", "middle"),)
+                )
+            )
+        },
+        "^controller.controller.groups: there is no control middle; there is left, right$",
+    ),
+    "actuators without names": (
+        {"actuator": actuators.PerControl(actuator=actuators.Lag())},  # pyright: ignore[reportArgumentType]
+        "^actuator.actuator = Lag has no name; a table by name is needed, such as ",
+    ),
+    "a reference without a name": (
+        {"reference": references.PerTarget(reference=references.Setpoint())},  # pyright: ignore[reportArgumentType]
+        "^reference.reference = Setpoint has no name; a table by name is needed, such as ",
+    ),
     "a controller of one": (
         {"controller": controllers.PID(cutoff=1.0)},
         "per-channel has one for each of left, right",
@@ -537,7 +559,7 @@ MISFITS = {
     ),
     "an unknown output": (
         {"controller": controllers.PerChannel(PIDS, {"left": "a", "right": "c"})},
-        "there is no channel c; there is a, b",
+        "^controller: there is no channel c; there is a, b$",
     ),
     "a controller too many": (
         {"controller": controllers.PerChannel(PIDS, {"left": "a"})},

@@ -1,5 +1,6 @@
 """The car of seven degrees of freedom against CommonRoad's single-track model, the half car, closed forms and SciPy."""
 
+import dataclasses
 import math
 import re
 
@@ -14,6 +15,7 @@ from scipy.integrate import solve_ivp
 import diffabs as d
 from diffabs import controllers, roads, stops
 from diffabs.core.pytree import get, replace
+from diffabs.loop.contracts import find_misfits
 from diffabs.parts.plants import GRAVITY, BrakeStart, Car, HalfCar
 from diffabs.parts.plants.car import BRAKES, WHEELS, CarControls, CarState, Wheels
 from diffabs.parts.plants.half_car import AxleBrakes, HalfCarState
@@ -341,6 +343,15 @@ def test_derivatives_of_a_run_are_those_of_differences():
 
 @killed_by("parts.plants.car", "+ downhill * jnp.sin(state.yaw)", "- downhill * jnp.sin(state.yaw)")
 @killed_by("parts.plants.half_car", "+ GRAVITY * jnp.sin(self.incline)", "- GRAVITY * jnp.sin(self.incline)")
+def test_a_torque_and_an_angle_have_no_least_one():
+    """The driver encloses the group: the message names the field at its place in the loop."""
+    loop = load("car-split").loop
+    mixed = (("rear_left_brake", "steer_angle"),)
+    loop = replace(loop, {"controller.controller": dataclasses.replace(loop.controller.controller, groups=mixed)})
+    line = "controller.controller.groups: rear_left_brake [N m], steer_angle [rad] have different units"
+    assert [message.partition(";")[0] for message in find_misfits(loop, {})] == [line]
+
+
 def test_gravity_acts_downhill_on_a_slope():
     """Without tyre forces and drag: g sin(slope) against the x axis of the road, and loads of m g cos(slope)."""
     slope, yaw, speed = 0.12, 0.3, 15.0

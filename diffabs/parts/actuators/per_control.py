@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from diffabs.core.blocks import Parallel
+from diffabs.core.blocks import Parallel, find_unnamed
 from diffabs.core.channels import select_channel
 from diffabs.core.protocols import Block
 from diffabs.core.pytree import part, pytree
@@ -38,6 +38,5 @@ class PerControl(Parallel):
         return units.of_channel(name, "")
 
     def problems(self) -> Iterator[str]:
-        """Yield a line if there is no actuator."""
-        if not self.actuator:
-            yield 'actuator = {} is empty; an actuator by control is needed, such as {"pump_1": Lag()}'
+        """Yield a line if there is no actuator, or one without a name."""
+        yield from find_unnamed("actuator", self.actuator, '{"pump_1": Lag()}')

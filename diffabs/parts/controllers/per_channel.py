@@ -97,12 +97,26 @@ class SelectLow(ChangedCommand):
         """Return the commands, with the least one in each group."""
         del t, signal
         for group in self.groups:
+            _check_group(group, command)
             lowest = reduce(smaller, (select_channel(command, name) for name in group))
             command = command._replace(**dict.fromkeys(group, lowest))
         return command
 
     def problems(self) -> Iterator[str]:
-        """Yield a line for a group that is no list of names."""
+        """Yield a line for a group that is no list of names, or an empty one."""
+        needed = 'lists of names are needed, such as [["left", "right"]]'
         for group in self.groups:
             if isinstance(group, str):
-                yield f'groups: {group} is one name; lists of names are needed, such as [["left", "right"]]'
+                yield f"groups: {group} is one name; {needed}"
+            elif not group:
+                yield f"groups: a group is empty; {needed}"
+
+
+def _check_group(group: tuple[str, ...], command: Any) -> None:
+    """Raise ValueError for a name that is no control, or for controls with different units."""
+    if unknown := [name for name in group if name not in command._fields]:
+        raise ValueError(f"groups: there is no control {', '.join(unknown)}; there is {', '.join(command._fields)}")
+    units = {name: type(command).units[name] for name in group}
+    if len({*units.values()}) > 1:
+        named = ", ".join(f"{name} [{unit}]" for name, unit in units.items())
+        raise ValueError(f"groups: {named} have different units; the least of them is meaningless")

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from diffabs.core.blocks import Parallel
+from diffabs.core.blocks import Parallel, find_unnamed
 from diffabs.core.channels import select_output
 from diffabs.core.messages import named_tuple
 from diffabs.core.protocols import Memory, Reference
@@ -50,6 +50,5 @@ class PerTarget(Parallel):
         return units.of_channel("", name)
 
     def problems(self) -> Iterator[str]:
-        """Yield a line if there is no reference."""
-        if not self.reference:
-            yield 'reference = {} is empty; a reference for each output is needed, such as {"level_1": Setpoint()}'
+        """Yield a line if there is no reference, or one without a name."""
+        yield from find_unnamed("reference", self.reference, '{"level_1": Setpoint()}')

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import jax.numpy as jnp
 
-from diffabs.core.blocks import Parallel
+from diffabs.core.blocks import Parallel, find_unnamed
 from diffabs.core.channels import select_output
 from diffabs.core.protocols import Block, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import param, part, pytree
@@ -52,9 +52,8 @@ class PerOutput(Parallel):
         return units.of_channel("", name)
 
     def problems(self) -> Iterator[str]:
-        """Yield a line if there is no sensor."""
-        if not self.sensor:
-            yield 'sensor = {} is empty; a sensor by output is needed, such as {"level_1": OutputNoise()}'
+        """Yield a line if there is no sensor, or one without a name."""
+        yield from find_unnamed("sensor", self.sensor, '{"level_1": OutputNoise()}')
 
 
 def _has_channel(signal: PyTree, name: str) -> bool:
