@@ -223,6 +223,32 @@ def test_norms_against_slicot():
     np.testing.assert_allclose(h2, squares, rtol=1e-10)
 
 
+@killed_by("linear.responses.response", "turned = (reduced @", "turned = (0.9 * reduced @")
+def test_derivatives_of_a_norm_whose_smaller_singular_values_are_equal():
+    """Two slow channels are equal, and the fourth is zero; the greatest, x^3/(s^2 + 2 z x s + x^2), has a closed form.
+
+    Its peak is x/(2 z sqrt(1 - z^2)). A rotation of the inputs with x changes no singular value.
+    """
+    z = 0.1
+
+    def norm(x):
+        a = jnp.zeros((4, 4)).at[0, 1].set(x).at[1, 0].set(-x).at[1, 1].set(-2 * z * x)
+        a = a.at[2, 2].set(-1.0).at[3, 3].set(-1.0)
+        b = jnp.zeros((4, 4)).at[1, 0].set(x).at[2, 1].set(0.1).at[3, 2].set(0.1)
+        turn = jnp.eye(4).at[:2, :2].set(jnp.array([[jnp.cos(x), -jnp.sin(x)], [jnp.sin(x), jnp.cos(x)]]))
+        c = jnp.zeros((4, 4)).at[0, 0].set(x).at[1, 2].set(1.0).at[2, 3].set(1.0)
+        return hinf_norm(Transfer(a, b @ turn, c, jnp.zeros((4, 4)))).value ** 2  # pyright: ignore[reportArgumentType]
+
+    @compile_quickly
+    def expand(x):
+        value_and_slope = jax.value_and_grad(norm)
+        (value, slope), (_, bend) = jax.jvp(value_and_slope, (x,), (1.0,))
+        return value, slope, bend
+
+    factor = (2 * z * np.sqrt(1 - z**2)) ** -2
+    np.testing.assert_allclose(expand(1.5), [2.25 * factor, 3.0 * factor, 2.0 * factor], rtol=1e-8)
+
+
 # The matrix of SLICOT's example of AB13MD, with the published bound 41.74753408.
 ROWS = """-1+6j 2-3j 3+8j 3+8j -5-9j -6+2j|4+2j -2+5j -6-7j -4+11j 8-7j 12-1j|5-4j -4-8j 1-3j -6+14j 2-5j 4+16j"""
 SLICOT_MATRIX = np.array([[complex(x) for x in row.split()] for row in ROWS.split("|")] * 2)

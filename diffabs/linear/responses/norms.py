@@ -38,6 +38,15 @@ def hinf_norm(system: Transfer | TracedSystem) -> FrequencyPeak:
         5.025189
     """
     system = as_arrays(system)
+    peak = highest(*find_norm_peaks(system))
+    return peak._replace(value=jnp.where(_is_stable(jax.lax.stop_gradient(system)), peak.value, jnp.nan))
+
+
+def find_norm_peaks(system: TracedSystem) -> tuple[Array, Array]:
+    """Return the local maxima of the largest singular value of a response, and their frequencies.
+
+    The maxima have no order; missing ones are -inf. Both ends of the frequency axis count.
+    """
     searched = jax.lax.stop_gradient(system)
 
     def measure(w: Array) -> Array:
@@ -54,8 +63,7 @@ def hinf_norm(system: Transfer | TracedSystem) -> FrequencyPeak:
     tops, at = jnp.append(tops, measure(ends)), jnp.append(at, ends)
     if system.period is None:
         tops, at = jnp.append(tops, largest_singular_values(system.D[None])), jnp.append(at, jnp.inf)
-    peak = highest(tops, at)
-    return peak._replace(value=jnp.where(_is_stable(searched), peak.value, jnp.nan))
+    return tops, at
 
 
 @compile_for_systems

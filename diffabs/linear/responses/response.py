@@ -117,13 +117,46 @@ def _delay_factors(system: TracedSystem, w: Array) -> Array:
 
 
 def largest_singular_values(matrices: Array) -> Array:
-    """Return the largest singular value of each matrix (k, p, m)."""
+    """Return the largest singular value of each matrix (k, p, m); its derivative at a zero matrix is 0."""
     if 1 in matrices.shape[1:]:
-        # The square root of a sum of squares has no derivative at 0, where a response may be.
         squares = jnp.sum(matrices.real**2 + matrices.imag**2, axis=(1, 2))
-        zero = squares == 0
-        return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squares)))
-    return jnp.linalg.svd(matrices, compute_uv=False)[:, 0]
+    else:
+        p, m = matrices.shape[1:]
+        squares = _top_eigenpairs(_adjoint(matrices) @ matrices if m <= p else matrices @ _adjoint(matrices))[0]
+    # The square root has no derivative at 0, where a response may be.
+    zero = squares <= 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squares)))
+
+
+@jax.custom_jvp
+def _top_eigenpairs(hermitian: Array) -> tuple[Array, Array, Array]:
+    """Return the largest eigenvalue (k,), its eigenvector (k, n) and the pseudo-inverse of their residual (k, n, n).
+
+    The derivatives need a gap to the second eigenvalue only, and without one they are large, not infinite. Those of a
+    full decomposition are NaN as soon as any two eigenvalues are equal, as the zeros of a matrix of low rank are.
+    """
+    values, vectors = jnp.linalg.eigh(hermitian)
+    top, others = values[:, -1], vectors[:, :, :-1]
+    gaps = jnp.maximum(top[:, None] - values[:, :-1], jnp.finfo(top.dtype).eps * jnp.where(top > 0, top, 1.0)[:, None])
+    return top, vectors[:, :, -1], (others / gaps[:, None, :]) @ _adjoint(others)
+
+
+@_top_eigenpairs.defjvp
+def _top_eigenpairs_jvp(
+    primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
+    top, vector, reduced = _top_eigenpairs(*primals)
+    forced = (tangents[0] @ vector[:, :, None])[:, :, 0]
+    slope = jnp.sum(jnp.conj(vector) * forced, axis=1).real
+    turned = (reduced @ forced[:, :, None])[:, :, 0]
+    # G. H. Golub, V. Pereyra (1973): the derivative of a pseudo-inverse of constant rank.
+    bent = (reduced @ turned[:, :, None]) * jnp.conj(vector)[:, None, :]
+    moved = reduced @ tangents[0] @ reduced - slope[:, None, None] * (reduced @ reduced) - bent - _adjoint(bent)
+    return (top, vector, reduced), (slope, turned, moved)
+
+
+def _adjoint(matrices: Array) -> Array:
+    return jnp.conj(jnp.swapaxes(matrices, 1, 2))
 
 
 @jax.custom_jvp
