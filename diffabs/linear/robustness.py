@@ -154,12 +154,16 @@ def frequencies_around(
     return np.geomspace(low, min([high, *half]), count)
 
 
-def sensitivity_gains(loops: Sequence[OpenLoop], w: np.ndarray) -> tuple[Float[np.ndarray, "k n"], ...]:
-    """Return |S| and |T|, each (k, n), of k loops at n frequencies [rad/s].
+def loop_responses(loops: Sequence[OpenLoop], w: np.ndarray) -> np.ndarray:
+    """Return L, complex, (k, n, p, p), of k loops with p channels at n frequencies [rad/s]."""
+    return np.array([loop.transfer().response(w) for loop in loops])
+
+
+def sensitivity_gains(opened: np.ndarray) -> tuple[Float[np.ndarray, "k n"], ...]:
+    """Return |S| and |T|, each (k, n), of k loops at n frequencies from L, (k, n, p, p).
 
     Of a loop with several channels they are the largest singular values.
     """
-    opened = np.array([loop.transfer().response(w) for loop in loops])
     identity = np.eye(opened.shape[-1])
     sensitivity = np.linalg.inv(identity + opened)
     return tuple(np.linalg.norm(gain, 2, axis=(2, 3)) for gain in (sensitivity, identity - sensitivity))

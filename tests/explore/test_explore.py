@@ -29,7 +29,7 @@ from diffabs.linear.robustness import System
 from diffabs.linear.stability_margins import closed_loop_poles
 from diffabs.linear.transfer import Transfer
 from diffabs.loop.run import rollout
-from diffabs.output.explore import charts, curves, friction, saving, stability, tuning
+from diffabs.output.explore import charts, curves, frequency_charts, friction, saving, stability, tuning
 from diffabs.output.explore.knobs import SLIDER_STEPS, is_vehicle
 from diffabs.output.explore.panels import Curve, Curves, Fan, Panel, Spread
 from diffabs.output.explore.session import AS_GIVEN, Session, check_edit, load_basis
@@ -96,7 +96,8 @@ def turn(session, key, given):
 def test_every_packaged_scenario_opens_with_what_one_drags(name):
     found = Session(name)
     units = [found.knobs[key].spec.unit for key in found.first]
-    assert units[0] in ("kg", "kg m^2")  # what is heavy comes first
+    heavy = {"kg", "kg m^2"} & {spec.unit for _, spec, _ in parameters(found.original.loop)}
+    assert units[0] in heavy if heavy else units  # what is heavy comes first
     assert any(key.startswith("controller.") for key in found.first)
     assert ("plant.road.scale" in found.first) == hasattr(found.original.loop.plant, "road")
     assert ("initial.speed" in found.first) == hasattr(found.original.loop.initial, "speed")
@@ -414,16 +415,21 @@ def test_margins_are_those_of_the_library(session):
     assert found.box.systems == 8  # corners of mass, and speed between start and stop; four points inside
     assert found.box.worst["phase"] <= found.margins["phase"]
     assert np.all(found.poles.real < 0)
-    w, here, goal = found.sensitivity
+    w, opened, here, goal, peak = found.curves
+    np.testing.assert_allclose(np.abs(1 / (1 + opened)), here, rtol=1e-12)
+    assert peak == math.inf
     assert np.max(here) == pytest.approx(1 / oracle.modulus, rel=1e-2)
     assert np.all(goal == math.inf)
-    np.testing.assert_allclose(stability.sensitivity_curve(chosen, w).gain, here, rtol=1e-12)
-    w, least, greatest = found.box.sensitivity
-    inside = stability.sensitivity_curve(chosen, w).gain  # this loop is a corner
+    np.testing.assert_allclose(stability.loop_curves(chosen, w).gain, here, rtol=1e-12)
+    w, around, least, greatest = found.box.curves
+    assert around.shape == (8, len(w))
+    inside = stability.loop_curves(chosen, w).gain  # this loop is a corner
     assert np.all((least <= inside * (1 + 1e-9)) & (inside <= greatest * (1 + 1e-9)))
     assert np.max(greatest / least) > 1.5
     lost = dataclasses.replace(chosen, loop=replace(chosen.loop, {"controller.gain": (11753.0, 48.0)}))
-    assert np.all(np.isnan(stability.sensitivity_curve(lost, w).gain))
+    lost_curves = stability.loop_curves(lost, w)
+    assert np.all(np.isnan(lost_curves.gain))
+    np.testing.assert_allclose(lost_curves.opened, -stability.loop_curves(chosen, w).opened, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -439,7 +445,8 @@ def test_the_box_is_looked_at_again_only_where_it_moves(session):
     fresh = stability.linearise_box(session.scenario())
     np.testing.assert_array_equal(moved.poles, fresh.poles)
     assert (moved.worst, moved.unstable, moved.systems) == (fresh.worst, fresh.unstable, fresh.systems)
-    np.testing.assert_array_equal(moved.sensitivity, fresh.sensitivity)
+    for name in moved.curves._fields:
+        np.testing.assert_array_equal(getattr(moved.curves, name), getattr(fresh.curves, name))
     turn(session, "plant.mass", "6")
     found = stability.linearise_box(session.scenario(), moved)
     whole = stability.linearise_box(session.scenario())
@@ -715,7 +722,7 @@ def test_each_channel_has_panels_of_its_own():
 
 @killed_by("output.explore.charts", "poles[np.isfinite(poles)]", "poles")
 def test_a_loop_that_is_not_well_posed_shows_no_poles():
-    empty = stability.SensitivityCurve(*np.empty((3, 0)))
+    empty = stability.LoopCurves(*np.empty((4, 0)), math.inf)
     loop = stability.Stability(None, 0.0, np.array([np.nan, -1.0]), {}, False, empty, stability.NO_BOX)
     change = json.loads(json.dumps(charts.change_poles(loop), allow_nan=False))
     assert [series["data"] for series in change["series"]] == [[], [[-1.0, 0.0]]]
@@ -737,30 +744,90 @@ def _integrator_with_lag(gain: float) -> System:
 @killed_by("linear.robustness", "in (sensitivity, identity - sensitivity)", "in (identity - sensitivity, sensitivity)")
 def test_the_range_of_sensitivities_is_that_of_closed_forms():
     gains = (0.5, 2.0, 7.0)
-    w, least, greatest = stability.find_sensitivity_range([_integrator_with_lag(gain) for gain in gains])
+    w, opened, least, greatest = stability.find_box_curves([_integrator_with_lag(gain) for gain in gains])
     s = 1j * w
+    np.testing.assert_allclose(opened, [gain / (s * (s + 1)) for gain in gains], rtol=1e-9)
     exact = np.abs([s * (s + 1) / (s**2 + s + gain) for gain in gains])
     np.testing.assert_allclose(least, exact.min(axis=0), rtol=1e-9)
     np.testing.assert_allclose(greatest, exact.max(axis=0), rtol=1e-9)
     crossover = math.sqrt((math.sqrt(1 + 4 * 7.0**2) - 1) / 2)  # |L| = 1: w^4 + w^2 = k^2
     assert w[-1] == pytest.approx(crossover * 10**1.5)
-    unstable = stability.find_sensitivity_range([_integrator_with_lag(gain) for gain in (2.0, -1.0)])
-    assert unstable.w.size == 0
+    unstable = stability.find_box_curves([_integrator_with_lag(gain) for gain in (2.0, -1.0)])
+    assert np.isnan([unstable.low, unstable.high]).all()
+    assert np.isfinite(unstable.opened).all()
 
 
-@killed_by("output.explore.charts", '"step": high - low}', '"step": high}')
-@killed_by("output.explore.charts", "max(LEAST_SHOWN_DB, bottom)", "bottom")
+@killed_by("output.explore.frequency_charts", '"low": low, "step": high - low}}', '"low": low, "step": high}}')
+@killed_by("output.explore.frequency_charts", "max(lower_end, bottom)", "bottom")
 def test_the_chart_of_sensitivities_is_in_decibels():
-    curve = stability.SensitivityCurve(
-        np.array([0.2, 2.0, 20.0]), np.array([0.0, 10.0, np.nan]), np.array([np.inf, 1.0, 2.0])
+    curve = stability.LoopCurves(
+        np.array([0.2, 2.0, 20.0]), np.ones(3), np.array([0.0, 10.0, np.nan]), np.array([np.inf, 1.0, 2.0]), math.inf
     )
-    over = stability.SensitivityRange(np.array([0.3, 30.0]), np.array([0.001, 1.0]), np.array([0.1, 100.0]))
-    change = json.loads(json.dumps(charts.change_sensitivity(curve, over), allow_nan=False))
+    over = stability.BoxCurves(np.array([0.3, 30.0]), np.ones((1, 2)), np.array([0.001, 1.0]), np.array([0.1, 100.0]))
+    change = json.loads(json.dumps(frequency_charts.change_sensitivity(curve, over, moved=True), allow_nan=False))
+    assert len(frequency_charts.change_sensitivity(curve, over, moved=False)["dataset"]) == 1
     here, box = (dataset["source"] for dataset in change["dataset"])
     assert here == {"w": [0.2, 2.0, 20.0], "s": [None, 20.0, None], "goal": [None, 0.0, 6.0206]}
     assert box == {"w": [0.3, 30.0], "low": [-60.0, 0.0], "step": [40.0, 40.0]}  # on top of the least
     assert change["xAxis"] == [{"min": 0.1, "max": 100.0}]
     assert change["yAxis"] == [{"min": -40.0, "max": 40, "interval": 10}]
+
+
+def _late_integrator(gain: float, delay: float, w: np.ndarray) -> np.ndarray:
+    """Return L = gain e^(-s delay)/(s (s + 1)) at frequencies w [rad/s]."""
+    return gain * np.exp(-1j * w * delay) / (1j * w * (1j * w + 1))
+
+
+def _sources(change) -> dict:
+    return {part["id"]: part["source"] for part in json.loads(json.dumps(change, allow_nan=False))["dataset"]}
+
+
+@killed_by("output.explore.frequency_charts", "np.exp(1j * angles) / here.peak", "np.exp(1j * angles) * here.peak")
+@killed_by("output.explore.frequency_charts", '"mirrored": -im', '"mirrored": im')
+@killed_by("output.explore.frequency_charts", "((0, 0), (0, 1))", "((0, 0), (0, 0))")
+def test_the_nyquist_chart_has_the_circle_of_the_goal_and_a_line_for_each_point_of_the_box():
+    w = np.geomspace(0.1, 10.0, 5)
+    opened, around = _late_integrator(2.0, 0.0, w), np.array([_late_integrator(k, 0.0, w) for k in (1.0, 3.0)])
+    loop = stability.LoopCurves(w, opened, np.ones(5), np.full(5, 2.0), 2.0)
+    box = stability.BoxCurves(w, around, np.ones(5), np.ones(5))
+    sources = _sources(frequency_charts.change_nyquist(loop, box, moved=True))
+    points = np.array(sources["goal"]["re"]) + 1j * np.array(sources["goal"]["im"])
+    np.testing.assert_allclose(np.abs(1 + points), 0.5, rtol=1e-6)
+    assert points[0] == pytest.approx(points[-1])
+    np.testing.assert_allclose(sources["here"]["re"], -2 / (1 + w**2), rtol=1e-6)  # of 2/(jw (1 + jw))
+    np.testing.assert_allclose(sources["here"]["im"], -2 / (w * (1 + w**2)), rtol=1e-6)
+    np.testing.assert_allclose(sources["here"]["mirrored"], np.negative(sources["here"]["im"]))
+    assert [i for i, x in enumerate(sources["box"]["re"]) if x is None] == [5, 11]
+    assert sources["box"]["im"][6] == pytest.approx(3 * sources["box"]["im"][0], rel=1e-6)
+    without = _sources(frequency_charts.change_nyquist(loop._replace(peak=math.inf), box, moved=False))
+    assert (without["goal"]["re"], "box" in without) == ([], False)
+    ratio = [high - low for low, high in frequency_charts.NYQUIST_WINDOW.values()]
+    assert ratio[0] / ratio[1] == frequency_charts.NYQUIST_SIZE["width"] / frequency_charts.NYQUIST_SIZE["height"]
+
+
+@killed_by(
+    "output.explore.frequency_charts",
+    "np.degrees(np.unwrap(np.angle(here.opened)))",
+    "np.degrees(np.angle(here.opened))",
+)
+@killed_by("output.explore.frequency_charts", "- 360 * np.round((angles[:, place", "- 0 * np.round((angles[:, place")
+@killed_by("output.explore.frequency_charts", "- 360 * np.round((angles[place] - beside) / 360)", "")
+def test_the_phase_is_continuous_and_beside_that_of_the_box():
+    w = np.geomspace(0.1, 30.0, 400)
+    lag = -90 - np.degrees(np.arctan(w))
+    loop = stability.LoopCurves(w, _late_integrator(2.0, 1.0, w), np.full(400, np.nan), np.full(400, np.inf), math.inf)
+    bode = frequency_charts.change_bode(loop, stability.NO_CURVES, moved=True)
+    here = _sources(bode)["here"]
+    np.testing.assert_allclose(here["phase"], lag - np.degrees(w), rtol=1e-5)  # to -1900 degrees
+    np.testing.assert_allclose(here["db"], 20 * np.log10(2 / (w * np.sqrt(1 + w**2))), atol=1e-5)
+    assert bode["yAxis"][1] == {"min": -720.0, "max": -90, "interval": 180}
+    # With gains of both signs the phases near the crossover are apart by half a turn, not by more.
+    around = np.array([_late_integrator(gain, 0.0, w) for gain in (-2.0, 2.0)])
+    box = stability.BoxCurves(w, around, *np.full((2, 400), np.nan))
+    sources = _sources(frequency_charts.change_bode(loop._replace(opened=around[1]), box, moved=True))
+    np.testing.assert_allclose(np.abs(sources["box"]["turn"]), 180.0)
+    offset = np.subtract(sources["here"]["phase"], sources["box"]["lag"])
+    assert np.all(np.isclose(offset, 0) | np.isclose(offset, 180))
 
 
 @killed_by("linear.robustness", "np.exp(np.interp(np.log(w), at, limits))", "np.interp(w, *np.array(shape).T)")
@@ -787,7 +854,8 @@ def test_charts_are_plain_json_whatever_a_run_was():
     bands = tuple(np.array([[0.0], [1.0], [2.0], [4.0], [8.0]]) for _ in range(2))
     steps = charts.change_fan(Fan(np.array([0.0]), bands, 200, 0, 0, ""))["dataset"][0]["source"]
     assert [steps[f"0.{i}"] for i in range(4)] == [[0.0], [1.0], [3.0], [4.0]]  # each on top of the one before
-    empty = [charts.pole_chart(), charts.change_poles(None), charts.sensitivity_chart()]
+    empty = [charts.pole_chart(), charts.change_poles(None)]
+    empty += [frequency_charts.sensitivity_chart(), frequency_charts.nyquist_chart(), frequency_charts.bode_chart()]
     json.dumps([charts.run_chart(found), change, *empty], allow_nan=False)
 
 

@@ -157,6 +157,24 @@ def test_dragging_a_slider_moves_the_curve_and_its_number(tabs):
 
 
 @needs_browser
+def test_the_curves_over_frequency_follow_a_drag_in_each_chart(tabs):
+    page = tabs()
+    rested(page)
+    source = """() => { const box = document.querySelector('[data-id=frequency]');
+      return getElement(+box.id.slice(1)).chart.getOption().dataset[0].source; }"""
+    for view, curve in (("Nyquist", "re"), ("Bode", "phase"), ("|S|", "s")):
+        page.click(f"[data-id=views] >> text='{view}'")
+        page.wait_for_function(f"curve => ({source})()[curve]?.length > 100", arg=curve)
+        before = page.evaluate(source)[curve]
+        drag(page, "controller.gain.1", 20)
+        rested(page)
+        page.wait_for_function(
+            f"([curve, before]) => JSON.stringify(({source})()[curve]) !== before", arg=[curve, json.dumps(before)]
+        )
+        assert len(page.evaluate(source)[curve]) == len(before)
+
+
+@needs_browser
 @pytest.mark.parametrize("name", names())
 def test_every_packaged_scenario_can_be_dragged_at_once(name, tmp_path, browser):
     """Also while everything is still being compiled; in the end nothing computes any more, and nothing failed."""

@@ -28,9 +28,11 @@ pytestmark = pytest.mark.usefixtures("any_step_is_stable")
 EXPLORE = pathlib.Path(diffabs.output.explore.page.__file__).parent
 NAME = 'my metric :title="alert(1)"'
 LIMIT_S = 60.0
-CURVE = stability.SensitivityCurve(np.array([1.0, 10.0]), np.array([0.5, 1.5]), np.full(2, math.inf))
+CURVES = stability.LoopCurves(
+    np.array([1.0, 10.0]), np.array([-1j, -0.1j]), np.array([0.5, 1.5]), np.full(2, math.inf), math.inf
+)
 LOOP = stability.Stability(
-    None, 0.0, np.array([-1.0]), dict.fromkeys(stability.MARGIN_KEYS, 2.0), True, CURVE, stability.NO_BOX
+    None, 0.0, np.array([-1.0]), dict.fromkeys(stability.MARGIN_KEYS, 2.0), True, CURVES, stability.NO_BOX
 )
 
 
@@ -597,14 +599,14 @@ def test_no_box_of_the_scenario_before(visit, monkeypatch):
 
 @killed_by("output.explore.page", "        if self.frequencies is None:\n", "        if True:\n")
 @killed_by("output.explore.page", "_sentence(error), True, None", "_sentence(error), True, self.frequencies")
-def test_a_drag_redraws_the_sensitivity_without_the_margins(visit, monkeypatch):
+def test_a_drag_redraws_the_curves_without_the_margins(visit, monkeypatch):
     async def user(opened):
         page, drawn = opened.page, []
         monkeypatch.setattr(curves, "run_fan", lambda *given: None)
         monkeypatch.setattr(stability, "linearise_box", lambda now, known: stability.NO_BOX._replace(systems=3))
         monkeypatch.setattr(stability, "box_of", lambda now: ())
         monkeypatch.setattr(stability, "linear_stability", lambda now, box: LOOP._replace(box=box or stability.NO_BOX))
-        monkeypatch.setattr(stability, "sensitivity_curve", lambda now, w: drawn.append(w) or CURVE._replace(w=w))
+        monkeypatch.setattr(stability, "loop_curves", lambda now, w: drawn.append(w) or CURVES._replace(w=w))
         await opened.draw()
         page.thinker.run()
         await asyncio.sleep(0)
@@ -617,13 +619,38 @@ def test_a_drag_redraws_the_sensitivity_without_the_margins(visit, monkeypatch):
         await asyncio.sleep(0)
         assert [list(w) for w in drawn] == [[1.0, 10.0]]
         shown = "band: least to greatest |S| at 3 points of [design.over]"
-        assert page.results.about_sensitivity.text == shown
+        assert page.results.frequency.about.text == shown
 
         monkeypatch.setattr(stability, "linear_stability", broken)
         page._poles(page.session.scenario(), page.version)
-        assert not page._sensitivity(page.session.scenario(), page.version)
+        assert not page._loop_curves(page.session.scenario(), page.version)
         await asyncio.sleep(0)
-        assert not page.results.sensitivity_card.visible
+        assert not page.results.frequency.element.visible
+
+    visit(user)
+
+
+@killed_by("output.explore.frequency_card", "moved=box is not None", "moved=True")
+@killed_by("output.explore.frequency_card", "        self.place.clear()\n", "")
+@killed_by("output.explore.frequency_card", "        if self.curves:\n", "        if False:\n")
+def test_only_the_chosen_chart_over_frequency_is_drawn(visit, monkeypatch):
+    async def user(opened):
+        card, changes = opened.page.results.frequency, []
+        unstable = CURVES._replace(gain=np.full(2, math.nan), peak=2.0)
+        box = stability.NO_BOX._replace(systems=2, unstable=1)
+        with opened.client:
+            card.show(unstable, box)
+            assert card.about.text == "no curve: the loop is not stable; no band: a loop of [design.over] is not stable"
+            for view, words in (("Nyquist", "the closed loop is NOT stable; light: 2"), ("Bode", "grey: 0 dB")):
+                card.switch.set_value(view)
+                assert words in card.about.text
+                canvas = opened.find("frequency")
+                assert canvas is card.canvas.element
+                assert canvas.options["dataset"][0]["source"]["w"] == [1.0, 10.0]
+            monkeypatch.setattr(card.canvas, "change", changes.append)
+            card.show(CURVES)
+            card.show(CURVES, box)
+        assert [[part["id"] for part in change["dataset"]] for change in changes] == [["here"], ["here", "box"]]
 
     visit(user)
 
@@ -632,7 +659,7 @@ def test_a_drag_redraws_the_sensitivity_without_the_margins(visit, monkeypatch):
 def test_a_quick_fan_is_slow_in_another_scenario(visit, monkeypatch):
     async def user(opened):
         page, done = opened.page, []
-        for name in ("poles", "sensitivity", "fan"):
+        for name in ("poles", "loop_curves", "fan"):
             monkeypatch.setattr(page, f"_{name}", lambda *given, **more: done.append(1) or True)
         await opened.draw()
         page.thinker.run()

@@ -32,3 +32,20 @@ class Canvas:
 def encode_change(option: JsonObject) -> str:
     """Return a change as JSON text."""
     return json.dumps(option, separators=(",", ":"), allow_nan=False)
+
+
+def merge_change(option: JsonObject, change: JsonObject) -> JsonObject:
+    """Return the options of a chart that has this change from its first frame.
+
+    The change has all datasets, and otherwise only limits of axes.
+    """
+    axes = {
+        name: [axis | limits for axis, limits in zip(_as_list(option[name]), parts, strict=True)]
+        for name, parts in change.items()
+        if name != "dataset"
+    }
+    return option | {"dataset": change["dataset"]} | axes
+
+
+def _as_list(axes: JsonObject | list[JsonObject]) -> list[JsonObject]:
+    return axes if isinstance(axes, list) else [axes]

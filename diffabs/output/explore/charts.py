@@ -1,4 +1,4 @@
-"""Curves, fan, poles and |S| as options of Apache ECharts, which draws the page's charts.
+"""Curves, fan and poles as options of Apache ECharts, which draws the page's charts.
 
 Numbers are stored in columns, once each.
 """
@@ -9,7 +9,7 @@ import numpy as np
 
 from diffabs.core.types import JsonObject
 from diffabs.output.explore.panels import Curves, Fan, Panel
-from diffabs.output.explore.stability import SensitivityCurve, SensitivityRange, Stability
+from diffabs.output.explore.stability import Stability
 
 BLUE, RED, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#767676", "#1F2933"
 CURVE_COLOURS = (BLUE, RED, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
@@ -20,7 +20,6 @@ AIMS = {"target": "dashed", "setpoint": "dotted", "command": "dashed"}
 OUTER, INNER = "5 to 95 % of the fan", "25 to 75 %"
 BEFORE = "before"
 FONT = "'Inter', 'Roboto', system-ui, sans-serif"
-LEAST_SHOWN_DB, TICK_DB = -40.0, 10  # lower end of the axis of |S|, and distance of its ticks
 LIMIT_ROOM = 1.5  # the control's axis ends at this multiple of its largest magnitude
 TOP, BOTTOM, BETWEEN = 6.0, 7.5, 6.5  # margins and gaps of the panels in percent of the height
 
@@ -153,70 +152,6 @@ def change_poles(stability: Stability | None) -> JsonObject:
         "yAxis": [{"min": -high, "max": high, "interval": high / 2}],
         "series": [{"id": "box", "data": around}, {"id": "poles", "data": here, "markArea": area}],
     }
-
-
-def sensitivity_chart() -> JsonObject:
-    """Return the options of the empty chart of |S| over frequency: band of the box, loop, and goal."""
-    axis = {"nameLocation": "middle", "nameTextStyle": {"fontSize": 11}, "axisLine": {"onZero": False}}
-    axis |= {"axisLabel": {"fontSize": 10}, "splitLine": {"lineStyle": {"color": "#E4E7EB"}}}
-    line = {"type": "line", "showSymbol": False, "symbol": "none"}
-    # The lower area of the stack is transparent; it lifts the band to the least |S|.
-    band = {**line, "datasetId": "box", "stack": "box", "stackStrategy": "all", "silent": True}
-    band |= {"lineStyle": {"width": 0}, "tooltip": {"show": False}}
-    curve, goal = {"color": BLUE, "width": 2}, {"color": RED, "width": 1.4, "type": "dashed"}
-    return {
-        "animation": False,
-        "textStyle": {"fontFamily": FONT, "color": INK},
-        "grid": {"left": 58, "right": 14, "top": 12, "bottom": 40},
-        "tooltip": {
-            "trigger": "axis",
-            "confine": True,
-            ":valueFormatter": "v => v == null || isNaN(v) ? '-' : `${(+v).toPrecision(3)} dB`",
-        },
-        "axisPointer": {"label": {"precision": 3}},
-        "xAxis": {**axis, "type": "log", "name": "frequency [rad/s]", "nameGap": 24},
-        "yAxis": {**axis, "type": "value", "name": "|S| [dB]", "nameGap": 42},
-        "dataset": [
-            {"id": "here", "source": {"w": [], "s": [], "goal": []}},
-            {"id": "box", "source": {"w": [], "low": [], "step": []}},
-        ],
-        "series": [
-            {**band, "name": "", "encode": {"x": "w", "y": "low"}, "areaStyle": {"opacity": 0}},
-            {**band, "name": "box", "encode": {"x": "w", "y": "step"}, "areaStyle": {"color": BLUE, "opacity": 0.2}},
-            {**line, "name": "|S|", "datasetId": "here", "encode": {"x": "w", "y": "s"}}
-            | {"lineStyle": curve, "itemStyle": {"color": BLUE}, "z": 4},
-            {**line, "name": "goal", "datasetId": "here", "encode": {"x": "w", "y": "goal"}}
-            | {"lineStyle": goal, "itemStyle": {"color": RED}, "z": 3},
-        ],
-    }
-
-
-def change_sensitivity(here: SensitivityCurve, box: SensitivityRange) -> JsonObject:
-    """Return the change of the chart that shows |S| of a loop, its goal, and the range over the box."""
-    low, high, line, goal = (_to_db(gain) for gain in (box.low, box.high, here.gain, here.goal))
-    w = np.concatenate([here.w, box.w])
-    shown = np.concatenate([low, high, line, goal])
-    shown = shown[np.isfinite(shown)]
-    decades = np.log10([w.min(), w.max()])
-    axes: JsonObject = {"xAxis": [{"min": 10.0 ** math.floor(decades[0]), "max": 10.0 ** math.ceil(decades[1])}]}
-    if shown.size:
-        bottom, top = (TICK_DB * end for end in (math.floor(shown.min() / TICK_DB), math.ceil(shown.max() / TICK_DB)))
-        axes["yAxis"] = [{"min": max(LEAST_SHOWN_DB, bottom), "max": max(top, bottom + TICK_DB), "interval": TICK_DB}]
-    sources = {
-        "here": {"w": here.w, "s": line, "goal": goal},
-        "box": {"w": box.w, "low": low, "step": high - low},
-    }
-    return axes | {
-        "dataset": [
-            {"id": name, "source": {key: round_for_screen(values) for key, values in source.items()}}
-            for name, source in sources.items()
-        ]
-    }
-
-
-def _to_db(gain: np.ndarray) -> np.ndarray:
-    with np.errstate(divide="ignore"):  # a zero of S has -inf dB, which the chart leaves out
-        return 20 * np.log10(gain)
 
 
 def _points(values: np.ndarray, period: float | None) -> list[list[float]]:

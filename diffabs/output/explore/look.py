@@ -51,7 +51,8 @@ body { background: #F3F5F7; color: #1F2933; font-family: 'Inter', 'Roboto', syst
 .verdict.refuted { border-color: #D55E00; background: #FCEFE6; }
 .verdict.undecided { border-color: #E69F00; background: #FDF6E3; }
 .poles { height: 218px; width: 100%; }
-.sensitivity { height: 176px; width: 100%; }
+.frequency { height: 220px; width: 100%; }
+.right .q-btn-toggle .q-btn { padding: 0 8px; min-height: 20px; font-size: 11.5px; }
 .grid-table { display: grid; column-gap: 10px; row-gap: 2px; font-size: 12.5px; font-variant-numeric: tabular-nums; }
 .grid-table .head { color: #7B8794; font-size: 11px; }
 .grid-table .number { text-align: right; white-space: nowrap; }

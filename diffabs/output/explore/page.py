@@ -1,4 +1,4 @@
-"""The page of one tab: sliders on the left, curves in the middle, verdict, poles, |S| and metrics on the right."""
+"""The page of one tab: sliders on the left, curves in the middle, the linear loop and metrics on the right."""
 
 import asyncio
 import contextlib
@@ -252,9 +252,9 @@ class Page:
         if version >= self.oldest_valid:
             self.results.stability(loop_stability, fresh=whole and version == self.version)
 
-    def _show_sensitivity(self, curve: stability.SensitivityCurve, version: int) -> None:
+    def _show_loop_curves(self, loop_curves: stability.LoopCurves, version: int) -> None:
         if version >= self.oldest_valid:
-            self.results.sensitivity(curve)
+            self.results.frequency.show(loop_curves)
 
     def _show_verdict(self, verdict: ProofVerdict, version: int) -> None:
         if version == self.version:
@@ -289,7 +289,7 @@ class Page:
         """Compute everything except the curve: quick results during a drag, the others after a rest."""
         if version != self.version:
             return
-        steps = {"poles": self._poles, "sensitivity": self._sensitivity, "fan": self._fan}
+        steps = {"poles": self._poles, "loop curves": self._loop_curves, "fan": self._fan}
         quick = [name for name in steps if self.learned.get(name, math.inf) < QUICK_JOB_S]
         for name in quick:
             self._time_step(name, steps[name], now, version)
@@ -321,7 +321,7 @@ class Page:
         return version == self.version
 
     def _poles(self, now: Scenario, version: int, *, box: bool = False) -> bool:
-        """Show poles, margins and |S| of this loop, and return whether there are any.
+        """Show poles, margins and curves of this loop, and return whether there are any.
 
         Those of the box are the cached ones, or with `box` they are computed for this loop.
         """
@@ -333,24 +333,24 @@ class Page:
                 self.later(self._learn, "box", around, version)
             shown = stability.linear_stability(now, around)
             self.box_current = around is not None and around.of == stability.box_of(now)
-            self.frequencies = shown.sensitivity.w
+            self.frequencies = shown.curves.w
         except Exception as error:  # the card shows every error, and the thread goes on
             shown, self.box_current, self.frequencies = _sentence(error), True, None
         self.later(self._show_stability, shown, version, self.box_current)
         return not isinstance(shown, str)
 
-    def _sensitivity(self, now: Scenario, version: int) -> bool:
-        """Show |S| at the frequencies of the loop whose poles were shown last, and return whether there is any.
+    def _loop_curves(self, now: Scenario, version: int) -> bool:
+        """Show L and |S| at the frequencies of the loop whose poles were shown last, and return whether there are any.
 
         It takes a fraction of the time of the margins, so it follows a drag.
         """
         if self.frequencies is None:
             return False
         try:
-            curve = stability.sensitivity_curve(now, self.frequencies)
+            loop_curves = stability.loop_curves(now, self.frequencies)
         except Exception:  # the step of the poles says the same, and why
             return False
-        self.later(self._show_sensitivity, curve, version)
+        self.later(self._show_loop_curves, loop_curves, version)
         return True
 
     def _fan(self, now: Scenario, version: int) -> bool:

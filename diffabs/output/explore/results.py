@@ -1,15 +1,15 @@
-"""The right column: verdict, map of poles, |S| over frequency, margins, and metrics of the run."""
+"""The right column: verdict, map of poles, curves over frequency, margins, and metrics of the run."""
 
-import numpy as np
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.core.types import JsonObject, PyTree
 from diffabs.output.explore import charts
 from diffabs.output.explore.canvas import Canvas
+from diffabs.output.explore.frequency_card import FrequencyCard
 from diffabs.output.explore.knobs import unit_words
 from diffabs.output.explore.panels import NO_VALUE, format_reading
 from diffabs.output.explore.session import CERTIFIED, REFUTED, UNDECIDED, ProofVerdict
-from diffabs.output.explore.stability import BoxLoops, SensitivityCurve, Stability, format_margin
+from diffabs.output.explore.stability import Stability, format_margin
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 
@@ -46,11 +46,8 @@ class ResultsPanel:
         self.map: Canvas = Canvas(charts.pole_chart(), "poles", "poles")
         self.none: ui.label = ui.label("").classes("note").props("data-id=about-poles")
         self.poles_of: ui.label = ui.label("").classes("note").props("data-id=poles-of")
-        with ui.element("div") as self.sensitivity_card:
-            with ui.element("div").classes("card-title"):
-                ui.label("sensitivity S of the linearised loop")
-            self.sensitivity_map: Canvas = Canvas(charts.sensitivity_chart(), "sensitivity", "sensitivity")
-            self.about_sensitivity: ui.label = ui.label("").classes("note").props("data-id=about-sensitivity")
+        self.frequency: FrequencyCard = FrequencyCard()
+        self.frequency.build()
         table = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
         self.margin_cells: dict[str, tuple[PyTree, PyTree]] = {}
         with table.props("data-id=margins"):
@@ -100,7 +97,7 @@ class ResultsPanel:
             self.cells[name].set_text(format_reading(value))
 
     def stability(self, outcome: Stability | str, *, fresh: bool) -> None:
-        """Show poles, margins and |S|, or the reason why there are none.
+        """Show poles, margins and curves over frequency, or the reason why there are none.
 
         `outcome` is the stability or the reason as text. `fresh` says that it belongs to the current numbers.
         """
@@ -108,21 +105,15 @@ class ResultsPanel:
         loop = None if isinstance(outcome, str) else outcome
         self.map.change(charts.change_poles(loop))
         self.map.element.set_visibility(loop is not None)
-        self.sensitivity_card.set_visibility(loop is not None)
+        self.frequency.element.set_visibility(loop is not None)
         if loop:
-            self.box: BoxLoops = loop.box
-            self.sensitivity(loop.sensitivity)
+            self.frequency.show(loop.curves, loop.box)
         self.none.set_text(outcome if isinstance(outcome, str) else self._of_poles(outcome))
         for name, (here, worst) in self.margin_cells.items():
             lowest = loop.box.worst if loop else {}
             here.set_text(format_margin(name, loop.margins[name], loop.stable) if loop else NO_VALUE)
             worst.set_text(format_margin(name, lowest[name], stable=True) if name in lowest else NO_VALUE)
         self.loop.set_text("" if loop is None else "stable" if loop.stable else "NOT STABLE")
-
-    def sensitivity(self, curve: SensitivityCurve) -> None:
-        """Show |S| of the loop, over the box that was shown last."""
-        self.sensitivity_map.change(charts.change_sensitivity(curve, self.box.sensitivity))
-        self.about_sensitivity.set_text(self._of_sensitivity(curve, self.box))
 
     def verdict(self, verdict: ProofVerdict) -> None:
         """Show the verdict of the proof."""
@@ -147,15 +138,3 @@ class ResultsPanel:
         lost = f", {around.unstable} NOT stable" if around.unstable else ""
         points = f"; grey and worst: {around.systems} points of [design.over]{lost}" if around.systems else ""
         return f"{kind}{late}{points}"
-
-    @staticmethod
-    def _of_sensitivity(curve: SensitivityCurve, box: BoxLoops) -> str:
-        """Return a line about the curve of |S|, its band and its goal, with the reason why one is missing."""
-        lines = [] if np.isfinite(curve.gain).any() else ["no curve: the loop is not stable"]
-        if box.unstable:
-            lines.append("no band: a loop of [design.over] is not stable")
-        elif box.systems:
-            lines.append(f"band: least to greatest |S| at {box.systems} points of [design.over]")
-        if np.isfinite(curve.goal).any():
-            lines.append("dashed: goal of [tune.constraints]")
-        return "; ".join(lines)

@@ -1,4 +1,4 @@
-"""Poles, margins and |S| of the linearised loop, for the current values and over the box of [design.over]."""
+"""Poles, margins, L and |S| of the linearised loop, for the current values and over the box of [design.over]."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from diffabs.core.channels import need_single_control
 from diffabs.core.pytree import replace
 from diffabs.core.types import PyTree
 from diffabs.linear.opened_loop import OpenLoop, open_loop
-from diffabs.linear.robustness import System, band, frequencies_around, sensitivity_gains, shape_bound
+from diffabs.linear.robustness import System, band, frequencies_around, loop_responses, sensitivity_gains, shape_bound
 from diffabs.linear.stability_margins import Margins, closed_loop_poles, is_stable
 from diffabs.scenario.scenario import Scenario
 
@@ -22,30 +22,45 @@ FREQUENCIES = 160  # points of a curve over frequency
 MARGIN_KEYS = ("gain_up", "gain_down", "phase", "delay", "modulus")
 
 
-class SensitivityRange(NamedTuple):
-    """Least (`low`) and greatest (`high`) |S| [1] of some loops at frequencies w [rad/s]; empty if one is unstable."""
+class BoxCurves(NamedTuple):
+    """Curves over frequency of k loops; without any loop all arrays are empty.
+
+    Attributes:
+        w: Frequencies [rad/s].
+        opened: Open loops L [1], complex, shape (k, frequencies).
+        low: Least |S| [1] of the loops; NaN if one is unstable.
+        high: Greatest |S| [1]; NaN if one is unstable.
+    """
 
     w: np.ndarray
+    opened: np.ndarray
     low: np.ndarray
     high: np.ndarray
 
 
-NO_RANGE = SensitivityRange(*np.empty((3, 0)))
+NO_CURVES = BoxCurves(np.empty(0), np.empty((0, 0)), np.empty(0), np.empty(0))
 
 
-class SensitivityCurve(NamedTuple):
-    """|S| [1] of a loop, and its bound in [tune.constraints], at frequencies w [rad/s].
+class LoopCurves(NamedTuple):
+    """Curves over frequency of a loop, and the bounds of |S| in [tune.constraints].
 
-    |S| is NaN for an unstable loop, and the bound is infinite if there is none.
+    Attributes:
+        w: Frequencies [rad/s].
+        opened: Open loop L [1], complex; NaN for a loop with several controls.
+        gain: |S| [1], with several controls its largest singular value; NaN for an unstable loop.
+        goal: Lower one of the bounds `sensitivity` and `shape` of |S| [1]; infinite without any.
+        peak: Bound `sensitivity` of |S| [1], the same at all frequencies; infinite without.
     """
 
     w: np.ndarray
+    opened: np.ndarray
     gain: np.ndarray
     goal: np.ndarray
+    peak: float
 
 
 class Stability(NamedTuple):
-    """Poles, margins and |S| of a loop, linearised at rest on its setpoint.
+    """Poles, margins and curves of a loop, linearised at rest on its setpoint.
 
     Attributes:
         period: Sampling period of the controller [s], or None in continuous time.
@@ -53,8 +68,8 @@ class Stability(NamedTuple):
         poles: Poles of the closed loop, in z for a sampled loop, else in s.
         margins: Margins by name, in SI.
         stable: Whether the loop with the current values is stable.
-        sensitivity: |S| of the loop, and its goal.
-        box: Poles, worst margins and |S| over the box of the ranges.
+        curves: L and |S| of the loop, and its goal.
+        box: Poles, worst margins and curves over the box of the ranges.
     """
 
     period: float | None
@@ -62,12 +77,12 @@ class Stability(NamedTuple):
     poles: np.ndarray
     margins: dict[str, float]
     stable: bool
-    sensitivity: SensitivityCurve
+    curves: LoopCurves
     box: "BoxLoops"
 
 
 class BoxLoops(NamedTuple):
-    """Poles, worst margins and |S| over the box of [design.over]: at its corners, and at some points inside.
+    """Poles, worst margins and curves over the box of [design.over]: at its corners, and at some points inside.
 
     They do not depend on the current values of the parameters that have a range.
 
@@ -77,7 +92,7 @@ class BoxLoops(NamedTuple):
         worst: Worst margins by name; empty without points or with an unstable loop.
         unstable: Number of points with an unstable loop.
         systems: Number of points.
-        sensitivity: |S| at all points.
+        curves: L and |S| at all points.
     """
 
     of: tuple[PyTree, ...]
@@ -85,10 +100,10 @@ class BoxLoops(NamedTuple):
     worst: dict[str, float]
     unstable: int
     systems: int
-    sensitivity: SensitivityRange
+    curves: BoxCurves
 
 
-NO_BOX = BoxLoops((), np.array([]), {}, 0, 0, NO_RANGE)
+NO_BOX = BoxLoops((), np.array([]), {}, 0, 0, NO_CURVES)
 
 
 def box_of(scenario: Scenario) -> tuple[PyTree, ...]:
@@ -104,7 +119,7 @@ def box_of(scenario: Scenario) -> tuple[PyTree, ...]:
 
 
 def linearise_box(scenario: Scenario, earlier: BoxLoops | None = None) -> BoxLoops:
-    """Return poles, worst margins and |S| of the linearised loops over the box of [design.over].
+    """Return poles, worst margins and curves of the linearised loops over the box of [design.over].
 
     A scenario without ranges, or with more than three, gets a result with zero points. `earlier` is returned if the
     box has not changed. Raises ValueError for a loop without a linear model.
@@ -119,11 +134,11 @@ def linearise_box(scenario: Scenario, earlier: BoxLoops | None = None) -> BoxLoo
     worst = {name: margin_values(system.margins)[name] for name, system in over.worst().items() if name in MARGIN_KEYS}
     poles = np.concatenate([closed_loop_poles(system.loop.transfer()) for system in over.systems])
     systems = over.systems
-    return BoxLoops(of, poles, worst, len(over.unstable), len(systems), find_sensitivity_range(systems))
+    return BoxLoops(of, poles, worst, len(over.unstable), len(systems), find_box_curves(systems))
 
 
 def linear_stability(scenario: Scenario, box: BoxLoops | None) -> Stability:
-    """Return poles, margins and |S| of the linearised loop. Raises ValueError for a loop without a linear model."""
+    """Return poles, margins and curves of the linearised loop. Raises ValueError for a loop without a linear model."""
     here = band(scenario.loop, {}, 0).systems[0]
     return Stability(
         here.loop.period,
@@ -131,24 +146,26 @@ def linear_stability(scenario: Scenario, box: BoxLoops | None) -> Stability:
         closed_loop_poles(here.loop.transfer()),
         margin_values(here.margins),
         here.margins.stable,
-        _sensitivity(scenario, here.loop, _frequencies([here]), stable=here.margins.stable),
+        _curves(scenario, here.loop, _frequencies([here]), stable=here.margins.stable),
         box or NO_BOX,
     )
 
 
-def sensitivity_curve(scenario: Scenario, w: np.ndarray) -> SensitivityCurve:
-    """Return |S| and its goal at frequencies w [rad/s], without the margins, which take longer.
+def loop_curves(scenario: Scenario, w: np.ndarray) -> LoopCurves:
+    """Return L, |S| and its goal at frequencies w [rad/s], without the margins, which take longer.
 
     Raises ValueError for a loop without a linear model.
     """
-    need_single_control(scenario.loop.plant, "the curve of |S|")
+    need_single_control(scenario.loop.plant, "a curve over frequency")
     loop = open_loop(scenario.loop)
-    return _sensitivity(scenario, loop, w, stable=is_stable(loop.transfer()))
+    return _curves(scenario, loop, w, stable=is_stable(loop.transfer()))
 
 
-def _sensitivity(scenario: Scenario, loop: OpenLoop, w: np.ndarray, *, stable: bool) -> SensitivityCurve:
-    gain = sensitivity_gains([loop], w)[0][0] if stable else np.full(w.shape, math.nan)
-    return SensitivityCurve(w, gain, find_sensitivity_goal(scenario, w))
+def _curves(scenario: Scenario, loop: OpenLoop, w: np.ndarray, *, stable: bool) -> LoopCurves:
+    opened = loop_responses([loop], w)
+    gain = sensitivity_gains(opened)[0][0] if stable else np.full(w.shape, math.nan)
+    peak = scenario.tune.constraints.sensitivity or math.inf
+    return LoopCurves(w, opened[0, :, 0, 0], gain, find_sensitivity_goal(scenario, w), peak)
 
 
 def find_sensitivity_goal(scenario: Scenario, w: np.ndarray) -> np.ndarray:
@@ -163,13 +180,14 @@ def _frequencies(systems: Sequence[System]) -> np.ndarray:
     return frequencies_around(crossovers, periods, count=FREQUENCIES)
 
 
-def find_sensitivity_range(systems: Sequence[System]) -> SensitivityRange:
-    """Return the least and the greatest |S| of some systems, around their crossovers."""
-    if not all(system.margins.stable for system in systems):
-        return NO_RANGE
+def find_box_curves(systems: Sequence[System]) -> BoxCurves:
+    """Return L, and the least and the greatest |S|, of some systems, around their crossovers."""
     w = _frequencies(systems)
-    gains, _ = sensitivity_gains([system.loop for system in systems], w)
-    return SensitivityRange(w, gains.min(axis=0), gains.max(axis=0))
+    opened = loop_responses([system.loop for system in systems], w)
+    if not all(system.margins.stable for system in systems):
+        return BoxCurves(w, opened[:, :, 0, 0], *np.full((2, len(w)), math.nan))
+    gains, _ = sensitivity_gains(opened)
+    return BoxCurves(w, opened[:, :, 0, 0], gains.min(axis=0), gains.max(axis=0))
 
 
 def margin_values(margins: Margins) -> dict[str, float]:

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from diffabs.linear.opened_loop import OpenLoop
-from diffabs.linear.robustness import frequencies, sensitivity_gains, shape_bound
+from diffabs.linear.robustness import frequencies, loop_responses, sensitivity_gains, shape_bound
 from diffabs.linear.stability_margins import Margins
 from diffabs.output.plot.style import COLOURS, GREY, Sheet, curve_style, label_axes, make_logarithmic, sheet
 
@@ -64,7 +64,8 @@ def draw_sensitivities(
     """
     w = frequencies([loop for loops in boxes.values() for loop in loops])
     for i, (name, loops) in enumerate(boxes.items()):
-        for ax, values in zip((sensitivity, complementary), sensitivity_gains(loops, w), strict=True):
+        gains = sensitivity_gains(loop_responses(loops, w))
+        for ax, values in zip((sensitivity, complementary), gains, strict=True):
             _draw_range(ax, w, values, name, i)
     for ax, bound in ((sensitivity, bounds.sensitivity), (complementary, bounds.complementary)):
         if bound is not None:
