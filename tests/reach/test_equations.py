@@ -134,7 +134,7 @@ NUMBERED = {
         "slip-cured", ["sensor=played-wheel-noise", "sensor.period=0.001", "sensor.noise=[0.0,0.1]"], integrated=False
     ).loop,
     "an encoder": load("slip-cured", ["sensor=encoder-slip", "sensor.period=0.001"], integrated=False).loop,
-    "a played command": d.braking(controller=d.controllers.PlayedCommand(period=0.01, commands=np.zeros(3))),
+    "a played command": d.braking(controller=d.controllers.PlayedCommand(period=0.01, commands=np.arange(3.0))),
 }
 
 

@@ -377,7 +377,10 @@ class _Operations:
             case "state":
                 return self.unknown[number] if number in self.unknown else self.value(self.equations.settled[number])
             case "select":
-                return self.value(args[2] if self.value(args[0]) else args[1])
+                truth = self.value(args[0])
+                if truth is None:
+                    return balls.hull(self.value(args[1]), self.value(args[2]))
+                return self.value(args[2] if truth else args[1])
             case "clamp":
                 x = self.value(args[0])
                 for limit, choose in ((args[1], max), (args[2], min)):
@@ -387,12 +390,13 @@ class _Operations:
                 return x
             case "inside":
                 return arb(self._inside(args))
-            case "and":
-                return self.value(args[0]) and self.value(args[1])
-            case "or":
-                return self.value(args[0]) or self.value(args[1])
+            case "and" | "or":
+                truths = [self.value(a) for a in args]
+                decides = name == "or"
+                return decides if decides in truths else None if None in truths else not decides
             case "not":
-                return not self.value(args[0])
+                truth = self.value(args[0])
+                return None if truth is None else not truth
             case "exp" | "log" | "sin" | "cos" | "atan":
                 return getattr(self.value(args[0]), name)()
             case "power":
@@ -450,6 +454,9 @@ class _Operations:
                 return _plus(self.slopes(args[0]), self.slopes(args[1]), 1 if name == "add" else -1)
             case "neg":
                 return {k: -x for k, x in self.slopes(args[0]).items()}
+            case "mul" if any(self.equations.operations[a][::2] == ("const", 0.0) for a in args):
+                self.value(i)  # 0 times a number that has a value, whatever its slopes are
+                return {}
             case "mul":
                 x, y = (self.value(a) for a in args)
                 first, second = self.slopes(args[0]), self.slopes(args[1])
@@ -457,7 +464,10 @@ class _Operations:
             case "meet":
                 return self.slopes(args[0])
             case "select":
-                return self.slopes(args[2] if self.value(args[0]) else args[1])
+                truth = self.value(args[0])
+                if truth is None:  # the number may jump, though both sides have slopes
+                    raise Undefined("a condition that the parameters decide differently")
+                return self.slopes(args[2] if truth else args[1])
             case "clamp":
                 if any(self.slopes(limit) for limit in args[1:] if limit >= 0):
                     raise Undefined("a limit that the parameters move")
@@ -481,8 +491,8 @@ def _plus(x: dict[int, arb], y: dict[int, arb], sign: int) -> dict[int, arb]:
     return total
 
 
-def _decide(name: str, x: arb, y: arb) -> bool:
-    """Return whether a comparison is true for all numbers of two balls."""
+def _decide(name: str, x: arb, y: arb) -> bool | None:
+    """Return whether a comparison is true for all numbers of two balls; None if for some only."""
     match name:
         case "lt":
             yes, no = x < y, x >= y
@@ -491,9 +501,7 @@ def _decide(name: str, x: arb, y: arb) -> bool:
         case _:
             yes, no = x.is_exact() and y.is_exact() and x == y, not x.overlaps(y)
             yes, no = (yes, no) if name == "eq" else (no, yes)
-    if not (yes or no):
-        raise Undefined("a condition that the parameters decide differently")
-    return bool(yes)
+    return True if yes else False if no else None
 
 
 def _polynomials(

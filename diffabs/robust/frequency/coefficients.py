@@ -32,7 +32,7 @@ from diffabs.robust.frequency.intervals import (
     sine,
     union,
 )
-from diffabs.robust.frequency.opened import FUNCTIONS, NO_ENTRY, OpenedEquations
+from diffabs.robust.frequency.opened import FUNCTIONS, NO_ENTRY, OpenedEquations, is_nought
 
 NEWTON_STEPS = 8
 KRAWCZYK_TRIES = 6
@@ -358,6 +358,14 @@ class _Evaluation:
             return {k: Enclosure(np.float64(1.0))} if k in variables else {}
         operands = self._operands(i)
         d = [slopes.get(a, {}) for a in operands]
+        if name == "select":  # where the condition is open, the number may jump: no slope, though both sides have none
+            zero, (yes, no) = Enclosure(np.float64(0.0)), values[args[0]]
+            decided = yes | no
+            valid = Enclosure(np.where(decided, 0.0, np.nan))
+            both = {
+                k: (d[1].get(k, zero), d[2].get(k, zero)) for k in ({**d[1], **d[2]} if decided.all() else variables)
+            }
+            return {k: _select((yes, no), a, b) + valid for k, (a, b) in both.items()}
         if not any(d):
             return {}
         if name in FUNCTIONS:
@@ -370,6 +378,9 @@ class _Evaluation:
                 return _sum_slopes(d[0], other)
             case "neg":
                 return {k: -x for k, x in d[0].items()}
+            case "mul" if is_nought(self.equations.operations, i):
+                nought: Enclosure = values[i]
+                return dict.fromkeys((*d[0], *d[1]), nought)
             case "mul":
                 x, y = (values[a] for a in args)
                 return _sum_slopes({k: s * y for k, s in d[0].items()}, {k: x * s for k, s in d[1].items()})
@@ -381,12 +392,6 @@ class _Evaluation:
                 moved = any(slopes.get(a) for a in args[1:])
                 unknown = Enclosure(np.float64(np.nan))
                 return {k: unknown if moved else inside * x for k, x in d[0].items()}
-            case "select":
-                zero = Enclosure(np.float64(0.0))
-                yes, no = values[args[0]]
-                valid = np.where(yes | no, 0.0, np.nan)
-                both = {k: (d[1].get(k, zero), d[2].get(k, zero)) for k in {**d[1], **d[2]}}
-                return {k: _select((yes, no), a, b) + Enclosure(valid) for k, (a, b) in both.items()}
             case "inside" | "round" | "lt" | "le" | "eq" | "ne" | "not" | "and" | "or":
                 valid = values[i] if name == "inside" else Enclosure(np.float64(np.nan))
                 return {k: x * (valid - valid) for k, x in d[0].items()} if name in ("inside", "round") else {}

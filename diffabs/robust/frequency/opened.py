@@ -181,7 +181,7 @@ class _OpenedDerivation(Derivation):
                 self.convert(self.lower(self._distance)[0], {}),
             )
             settled |= dict(enumerate(begin))
-            rest, unknown = [flow[0], *flow[3:]], unknown[3:]
+            rest, unknown = [self.pace_rate(flow[0], 1), *flow[3:]], unknown[3:]
         else:
             rest.append(self.convert(self.lower(track, z)[0], {}))
         holds = [*after, self.make("sub", (command, self.make("state", (), n)))] if m else []
@@ -256,6 +256,8 @@ class _OpenedDerivation(Derivation):
                 return self.total(along[0], NO_ENTRY if along[1] == NO_ENTRY else self.make("neg", (along[1],)))
             case "neg":
                 return NO_ENTRY if along[0] == NO_ENTRY else self.make("neg", (along[0],))
+            case "mul" if is_nought(self.operations, i):
+                return NO_ENTRY if along == [NO_ENTRY, NO_ENTRY] else i
             case "mul":
                 return self.total(self.product(along[0], args[1]), self.product(args[0], along[1]))
             case "inv":
@@ -271,6 +273,12 @@ class _OpenedDerivation(Derivation):
         if name in FUNCTIONS:
             return self.product(args[1], along[0])
         raise NoRule(f"{name}: a proof has no derivative of it")
+
+
+def is_nought(operations: Sequence[RealOperation], i: int) -> bool:
+    """Return whether an operation is 0 times a number: it has a value where that has one, and is its own derivative."""
+    name, args, _ = operations[i]
+    return name == "mul" and any(operations[a] == RealOperation("const", (), 0.0) for a in args)
 
 
 FUNCTIONS = ("exp", "log", "sin", "cos", "atan", "power")  # (u, g) with the derivative g du

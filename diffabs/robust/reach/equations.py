@@ -122,10 +122,32 @@ class RealGraph(Graph):
         """Create an empty graph."""
         super().__init__()
         self._sizes: dict[int, float] = {}
+        self._counts: dict[int, float] = {}
 
     def has_value(self, node: Node) -> bool:
         """Return whether a number is finite, in doubles, for all values of the inputs; False if that is unknown."""
         return self._size(node) < LARGEST_NUMBER
+
+    def is_count(self, node: Node) -> bool:
+        """Return whether an integer is computed from truths without an overflow; it is a real number then."""
+        return node.dtype.kind in "iu" and self._count(node) <= np.iinfo(node.dtype).max
+
+    def _count(self, node: Node) -> float:
+        """Return a bound of |integer| and of all integers it is computed from; infinite for other operations."""
+        if node.dtype == bool:
+            return 1.0
+        if node.id not in self._counts:
+            counts = [self._count(arg) for arg in node.args]
+            match node.op:
+                case "const":
+                    self._counts[node.id] = abs(float(node.attr))
+                case "add":
+                    self._counts[node.id] = sum(counts)
+                case "convert" | "min" | "max" | "lower" | "higher" | "select" if node.dtype.kind in "iu":
+                    self._counts[node.id] = max(counts)
+                case _:
+                    self._counts[node.id] = np.inf
+        return self._counts[node.id]
 
     def _size(self, node: Node) -> float:
         """Return a bound of |number| for all values of the inputs; infinite if it may have no value."""
@@ -162,7 +184,7 @@ class RealGraph(Graph):
             return self.op("not", finite) if name == "ne" else finite
         if not real or name in ("is_finite", "lt", "le", "gt", "ge", "eq", "ne"):
             return super().op(name, *args)
-        if name == "neg" and _is_finite(args[0]):
+        if name == "neg" and args[0].op == "const":
             return self.const(-args[0].attr)
         if all(map(_is_decimal, args)) and name in ("add", "sub", "mul"):
             exact = {"add": lambda x, y: x + y, "sub": lambda x, y: x - y, "mul": lambda x, y: x * y}
@@ -175,6 +197,17 @@ class RealGraph(Graph):
     def bits(self, x: Node, dtype: DTypeLike) -> Node:
         """Refuse the bits of a number, which real numbers have not."""
         raise Unsupported("lt_to", "a proof has no rule for a search in a table, as of jnp.interp or jnp.searchsorted")
+
+    def table(self, index: Node, column: tuple[Node, ...]) -> Node:
+        """Return the entry of a column at an index, by comparisons with numbers between two indices.
+
+        An enclosure of an index may be a little wider than the integer, but contains no such number.
+        """
+        *entries, entry = column
+        for i, x in reversed([*enumerate(entries)]):
+            below = self.op("lt", self._make("convert", (index,), np.float64), self.const(i + 0.5))
+            entry = self.select(below, entry, x)
+        return entry
 
     def any(self, condition: Node) -> Node:
         """Return the condition itself: a result of a branch that no lane takes is a placeholder only in a kernel."""
@@ -554,7 +587,7 @@ class Derivation:
     def operation(self, node: Node, args: list[int]) -> int:
         """Return the operation of a node whose operands are converted."""
         make, number = self.make, self.number
-        if node.dtype not in (np.float64, np.bool_) and node.op != "const":
+        if node.dtype not in (np.float64, np.bool_) and not self.graph.is_count(node):
             raise NoRule(f"{node.op}: the proof has no rule for numbers of the type {node.dtype}")
         match node.op:
             case "const":
@@ -580,6 +613,8 @@ class Derivation:
                 return make("select", (args[0], number(0.0), number(1.0)))
             case "convert" if node.args[0].op == "const":
                 return number(float(node.args[0].attr))
+            case "convert" if self.graph.is_count(node.args[0]):
+                return args[0]
             case "lt" | "le" | "eq" | "ne":
                 return make(node.op, tuple(args))
             case "and" | "or" | "not":
