@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import slycot
 from mutants import killed_by
+from scipy.optimize import linprog
 from scipy.signal import cont2discrete
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS
@@ -279,11 +280,75 @@ def test_structured_singular_value(real):
     assert upper == pytest.approx(bound, rel=1e-8)
     if any(real):
         assert upper == pytest.approx(41.74753408, rel=1e-9)
-        assert np.isnan(lower)
+        assert 0.98 * upper < lower < (1 + 1e-9) * upper
     else:
         assert lower == pytest.approx(float(upper), rel=1e-6)
     differences = [(along(h)[0][0] - along(-h)[0][0]) / (2 * h) for h in (1e-3, 1e-4)]
     assert min(abs(d / slope - 1) for d in differences) < 1e-5
+
+
+def lower_bounds(matrices, blocks, real):
+    """The lower bounds of matrices (k, n, n)."""
+    return np.asarray(compile_quickly(jax.vmap(lambda m: structured_singular_value(m, blocks, real).lower))(matrices))
+
+
+@killed_by("linear.responses.structured", "image / image", "image.conj() / image")
+def test_lower_bound_of_mixed_blocks():
+    """Below SLICOT's upper bound, mostly by less than 1 %."""
+    draw, blocks, real = np.random.default_rng(0), [1, 1, 1, 2], (True, True, False, False)
+    matrices = draw.normal(size=(100, 5, 5, 2)) @ [1, 1j]
+    matrices[50:] = matrices[50:].real
+    uppers = np.array([slycot.ab13md(m, np.array(blocks), np.where(real, 1, 2))[0] for m in matrices])
+    ratios = lower_bounds(matrices, blocks, real) / uppers
+    assert np.max(ratios) < 1 + 1e-6
+    assert np.mean(ratios > 0.99) > 0.65
+    assert np.mean(ratios > 0.95) > 0.9
+    assert np.min(ratios) > 0.5
+
+
+@killed_by(
+    "linear.responses.structured", "rises = jnp.sum(signs * slopes.imag)", "rises = -jnp.sum(signs * slopes.imag)"
+)
+def test_lower_bound_of_real_blocks():
+    """Real matrices: mu is at a corner. Rank one: a linear program. 2 x 2: both roots of the determinant."""
+    draw, real = np.random.default_rng(1), (True,) * 4
+    matrices = draw.normal(size=(40, 4, 4))
+    signs = [np.diag(s) for s in itertools.product([-1.0, 1.0], repeat=4)]
+    corners = np.linalg.eigvals(np.array(signs) @ matrices[:, None])
+    corners = np.max(np.where(np.abs(corners.imag) < 1e-9, corners.real, 0.0), axis=(1, 2))
+    columns, rows = draw.normal(size=(2, 40, 4, 2)) @ [1, 1j]
+    products = columns * rows  # 1 = sum of delta_i product_i with the least maximum of |delta_i|
+    sizes = []
+    for p in products:
+        equations = np.array([[*p.real, 0.0], [*p.imag, 0.0]])
+        limits = np.hstack([np.vstack([np.eye(4), -np.eye(4)]), -np.ones((8, 1))])
+        sizes.append(linprog([0, 0, 0, 0, 1], limits, np.zeros(8), equations, [1.0, 0.0], (None, None)).fun)
+    pairs = np.zeros((40, 4, 4), complex)
+    pairs[:, :2, :2] = draw.normal(size=(40, 2, 2, 2)) @ [1, 1j]
+    exact = np.array([real_mu_of_pair(m[:2, :2]) for m in pairs])
+    every = np.concatenate([matrices, columns[:, :, None] * rows[:, None], pairs])
+    lower = lower_bounds(every, [1] * 4, real)
+    expected = np.concatenate([corners, 1 / np.array(sizes), exact])
+    assert np.max(lower - expected * (1 + 1e-7)) <= 1e-9
+    reached = lower >= expected * (1 - 1e-6)
+    assert reached[:40].mean() > 0.7
+    assert reached[40:80].mean() > 0.9
+    assert reached[80:].mean() > 0.6  # two isolated places or none
+    assert np.sum(exact == 0) > 5  # no perturbation at all
+
+
+def real_mu_of_pair(m):
+    """1 - x a - y b + x y d = 0 has y = (1 - x a)/(b - x d), real at the roots of a quadratic."""
+    a, b, d = m[0, 0], m[1, 1], np.linalg.det(m)
+    roots = np.roots([(a * d.conj()).imag, -(a * b.conj() + d.conj()).imag, b.conj().imag])
+    places = [(x.real, ((1 - x * a) / (b - x * d)).real) for x in roots if abs(x.imag) < 1e-12 * abs(x)]
+    return max((1 / max(map(abs, place)) for place in places), default=0.0)
+
+
+def test_mu_of_a_real_number_is_discontinuous():
+    """|1 + 1e-3 j| with one real block: no real delta makes 1 - delta m vanish."""
+    lower = lower_bounds(np.array([[[1.0 + 0j]], [[1.0 + 1e-3j]], [[0j]], [[-2.0 + 0j]]]), [1], (True,))
+    np.testing.assert_allclose(lower, [1.0, 0.0, 0.0, 2.0], rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -11,11 +11,13 @@ The matrix depends on D and G linearly, so for each t the analytic centre of all
 Then t moves towards the largest eigenvalue there (method of centres: S. Boyd and L. El Ghaoui, Linear Algebra Appl. 188
 (1993)). The inverse of the matrix at the last centre is the dual solution, which gives the derivative in M.
 
-**Lower bound**, for complex blocks: the power iteration of A. Packard and J. Doyle, Automatica 29 (1993). It ends on a
-Delta, whose spectral radius of Delta M is a bound in any case.
+**Lower bound**: ascents over Delta, from several starts. Each step takes the Delta of norm 1 that makes the linearised
+eigenvalue of Delta M greatest while it stays real, as the fixed points of the power iteration of P. Young and J. Doyle
+(Proc. 29th IEEE Conf. Decision and Control, 1990) do. Any Delta with a real eigenvalue of Delta M proves a bound.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -30,7 +32,12 @@ CENTRES, NEWTON_STEPS = 60, 6  # levels t, and Newton steps to the centre of eac
 FIRST_LEVEL = 1.5  # first t, over the largest eigenvalue without scalings
 LEVEL_SHARE = 0.05  # of the way from the largest eigenvalue at the centre to the old t that the new t keeps
 LEAST_SQUARE = 1e-12  # mu^2 that counts as zero, relative to the largest singular value squared
-POWER_STEPS, POWER_STARTS = 200, 5
+ASCENT_STEPS, ASCENT_STARTS = 30, 10  # of the lower bound
+ANGLE_HALVINGS, STEEPEST = 50, 1.5707  # of the angle whose tangent is the multiplier, and its end [rad]
+OPEN_SIGN = 1e-6  # relative slope below which the multiplier leaves the sign of a real number open
+MADE_REAL, REAL_STEPS = 3, 8  # Deltas of each ascent from which Newton steps go to a real eigenvalue: start and best
+GREATEST_PENALTY = 3.0  # decades of the weight of an eigenvalue's distance from the real axis
+REAL_ROUNDINGS = 1e4  # roundings by which the angle of a real eigenvalue may miss zero
 
 
 class Mu(NamedTuple):
@@ -38,7 +45,7 @@ class Mu(NamedTuple):
 
     Attributes:
         upper: Upper bound, differentiable in the matrix.
-        lower: Lower bound, for complex blocks; NaN with a real block, which the iteration does not treat.
+        lower: Lower bound: the size of a perturbation that was found proves it, to rounding. 0 if none was found.
     """
 
     upper: Scalar
@@ -55,7 +62,8 @@ class _Scalings(NamedTuple):
 def structured_singular_value(matrix: AnyArray, blocks: Sequence[int], real: Sequence[bool] = ()) -> Mu:
     """Return bounds of mu of a square matrix for a structure of full blocks on the diagonal.
 
-    The upper bound is differentiable; both work under `jit` and `vmap`.
+    The upper bound is differentiable; both work under `jit` and `vmap`. With real blocks mu may jump in the matrix, and
+    both bounds may be far from it.
 
     Args:
         matrix: Matrix (n, n), real or complex.
@@ -73,6 +81,12 @@ def structured_singular_value(matrix: AnyArray, blocks: Sequence[int], real: Seq
         >>> M = np.array([[2.0, 2.0], [-1.0, -1.0]])
         >>> [f"{structured_singular_value(M, blocks).upper:.4f}" for blocks in ([2], [1, 1])]
         ['3.1623', '3.0000']
+
+        Two real numbers with det(I - Delta M) = 1 - 2 d1 + d2; both are 1/3 with opposite signs:
+
+        >>> mu = structured_singular_value(M, [1, 1], [True, True])
+        >>> print(f"{mu.lower:.4f} <= mu <= {mu.upper:.4f}")
+        3.0000 <= mu <= 3.0000
     """
     sizes, is_real = np.array(blocks, int), np.array(real if len(real) else [False] * len(blocks), bool)
     if np.ndim(matrix) != 2 or np.shape(matrix) != (sizes.sum(),) * 2 or (sizes < 1).any():
@@ -85,8 +99,8 @@ def structured_singular_value(matrix: AnyArray, blocks: Sequence[int], real: Seq
 
 @compile_once(("blocks", "real"), SAME_RESULT_OPTIONS)
 def _bound_both(matrix: Array, *, blocks: tuple[int, ...], real: tuple[bool, ...]) -> Mu:
-    lower = jnp.nan if any(real) else _bound_below(matrix, np.array(blocks))
-    return Mu(_bound_above(matrix, np.array(blocks), np.array(real)), lower)
+    sizes, is_real = np.array(blocks), np.array(real)
+    return Mu(_bound_above(matrix, sizes, is_real), _bound_below(matrix, sizes, is_real))
 
 
 def _bound_above(matrix: Array, sizes: np.ndarray, is_real: np.ndarray) -> Scalar:
@@ -142,11 +156,14 @@ def _bound_above(matrix: Array, sizes: np.ndarray, is_real: np.ndarray) -> Scala
     frozen = jax.lax.stop_gradient(matrix)
     start = _Scalings(jnp.zeros(len(sizes) - 1), jnp.zeros(len(real_places)))
 
+    least_slack = 16 * jnp.finfo(matrix.real.dtype).eps
+
     def lower(_: object, state: tuple[_Scalings, Array]) -> tuple[_Scalings, Array]:
         x, t = state
         x = centre(x, t)
         bound = level(x)
-        return x, bound + LEVEL_SHARE * (t - bound)
+        # At t = bound the matrix is singular and has no dual solution.
+        return x, bound + jnp.maximum(LEVEL_SHARE * (t - bound), least_slack * jnp.abs(bound))
 
     first = jnp.maximum(level(start), 0.0)
     scale = jnp.maximum(jnp.linalg.norm(frozen, 2) ** 2, 1e-30)
@@ -162,33 +179,110 @@ def _bound_above(matrix: Array, sizes: np.ndarray, is_real: np.ndarray) -> Scala
     return jnp.where(vanishes, 0.0, jnp.sqrt(jnp.where(vanishes, 1.0, square)))
 
 
-def _bound_below(matrix: Array, sizes: np.ndarray) -> Scalar:
-    """Return the largest spectral radius of Delta M at the ends of power iterations from several starts."""
+class _Perturbation(NamedTuple):
+    """A Delta of the structure with norm 1: q (n,) of the real blocks, unit vectors u and v (n,) of the complex ones.
+
+    A complex block is u v*; entries of the other kind of block play no part.
+    """
+
+    q: Array
+    u: Array
+    v: Array
+
+
+class _Eigenvalue(NamedTuple):
+    """An eigenvalue e of Delta M with M x and the left eigenvector y of y x = 1, so that de = y dDelta M x."""
+
+    value: Array
+    image: Array
+    row: Array
+
+
+def _bound_below(matrix: Array, sizes: np.ndarray, is_real: np.ndarray) -> Scalar:
+    """Return the greatest real eigenvalue of Delta M that ascents over Delta from several starts reach; 0 without one.
+
+    If e is a real eigenvalue of Delta M, Delta/e makes I - Delta M/e singular: mu >= |e|/s(Delta), whatever found it.
+    """
     matrix = jax.lax.stop_gradient(matrix)
     block_of = np.repeat(np.arange(len(sizes)), sizes)
+    same, in_real = block_of[:, None] == block_of, is_real[block_of]
+    first_of_complex = np.searchsorted(block_of, np.flatnonzero(~is_real))
+    rounding = REAL_ROUNDINGS * jnp.finfo(matrix.real.dtype).eps
 
     def norms(v: Array) -> Array:
         """Return the norm of each block of a vector, at each of its entries."""
         return jnp.sqrt(jnp.zeros(len(sizes)).at[block_of].add(jnp.abs(v) ** 2) + 1e-300)[block_of]
 
-    def iterate(_: object, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        b, w = state
-        a = matrix @ b
-        a = a / jnp.linalg.norm(a)
-        z = norms(w) / norms(a) * a
-        w = matrix.conj().T @ z
-        w = w / jnp.linalg.norm(w)
-        return norms(a) / norms(w) * w, w
+    def product(delta: _Perturbation) -> Array:
+        blocks = jnp.where(same & ~in_real, delta.u[:, None] * delta.v.conj(), jnp.diag(delta.q * in_real))
+        return blocks @ matrix
+
+    def rightmost(delta: _Perturbation, penalty: Array) -> _Eigenvalue:
+        """Return an eigenvalue that is large and near the positive real axis."""
+        values, vectors = jnp.linalg.eig(product(delta))
+        i = jnp.argmax(values.real - penalty * jnp.abs(values.imag))
+        return _Eigenvalue(values[i], matrix @ vectors[:, i], jnp.linalg.inv(vectors)[i])
+
+    def ascend(penalty: Array, delta: _Perturbation, _: None) -> tuple[_Perturbation, tuple[_Perturbation, Array]]:
+        """Return the Delta of norm 1 with the greatest linearised eigenvalue that is real; tan(a) is the multiplier."""
+        at = rightmost(delta, penalty)
+        slopes = jnp.where(in_real, at.row * at.image, 0.0)  # of the eigenvalue, in the entries of q
+        row, image = norms(at.row), norms(at.image)
+        complex_share = jnp.sum((row * image)[first_of_complex])
+
+        def halve(_: object, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+            # The dual function sum |Re s + tan(a) Im s| + share/cos(a) is convex in tan(a); this is its slope's sign.
+            low, high = ends
+            middle = 0.5 * (low + high)
+            signs = jnp.sign(slopes.real + jnp.tan(middle) * slopes.imag)
+            rises = jnp.sum(signs * slopes.imag) + complex_share * jnp.sin(middle) > 0
+            return jnp.where(rises, low, middle), jnp.where(rises, middle, high)
+
+        ends = (jnp.asarray(-STEEPEST), jnp.asarray(STEEPEST))
+        low, high = jax.lax.fori_loop(0, ANGLE_HALVINGS, halve, ends)
+        angle = 0.5 * (low + high)
+        along = slopes.real + jnp.tan(angle) * slopes.imag
+        q, turn = jnp.sign(along), jnp.exp(1j * angle)
+        # A number whose sign the multiplier leaves open makes the eigenvalue real.
+        doubts = jnp.where(in_real & (slopes.imag != 0), jnp.abs(along) / (jnp.abs(slopes) + 1e-300), jnp.inf)
+        free = jnp.arange(len(q)) == jnp.argmin(doubts)
+        rest = jnp.sum(jnp.where(free, 0.0, slopes * q)) + complex_share * turn
+        open_value = jnp.clip(-rest.imag / jnp.where(free & (slopes.imag != 0), slopes.imag, 1.0), -1.0, 1.0)
+        q = jnp.where(free & (doubts < OPEN_SIGN), open_value, q)
+        better = _Perturbation(q, turn * at.row.conj() / row, at.image / image)
+        better = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), better, delta)
+        return better, (delta, at.value.real - penalty * jnp.abs(at.value.imag))
+
+    def make_real(penalty: Array, delta: _Perturbation) -> _Perturbation:
+        """Return Delta after a Newton step of least norm to a real eigenvalue."""
+        at = rightmost(delta, penalty)
+        slopes = jnp.where(in_real, (at.row * at.image).imag, 0.0)
+        turning = (at.value - jnp.sum(jnp.where(in_real, at.row * at.image * delta.q, 0.0))).real
+        square = jnp.sum(slopes**2) + turning**2
+        # The slopes of an eigenvalue that is real may be rounding, and a step along them would be any number.
+        moves = (jnp.abs(at.value.imag) > 0.01 * rounding * jnp.abs(at.value)) & (square > 0)
+        step = jnp.where(moves, -at.value.imag / jnp.where(moves, square, 1.0), 0.0)
+        return _Perturbation(delta.q + step * slopes, delta.u * jnp.exp(1j * step * turning), delta.v)
 
     def bound(key: Array) -> Array:
-        parts = jax.random.normal(key, (2, 2, len(matrix)))
-        b, w = parts[0] + 1j * parts[1]
-        b, w = jax.lax.fori_loop(0, POWER_STEPS, iterate, (b / jnp.linalg.norm(b), w / jnp.linalg.norm(w)))
-        a = matrix @ b
-        # Delta of norm 1 that maps each block of a to the direction of that of b.
-        same = block_of[:, None] == block_of
-        delta = jnp.where(same, (b / norms(b))[:, None] * (a / norms(a)).conj(), 0.0)
-        return jnp.max(jnp.abs(jnp.linalg.eigvals(delta @ matrix)))
+        keys = jax.random.split(key, 3)
+        # Real blocks cannot turn an eigenvalue to the real axis: a large one far from it may hide a smaller one on it.
+        penalty = 10.0 ** jax.random.uniform(keys[2], maxval=GREATEST_PENALTY if is_real.all() else 0.0)
+        q = jax.random.uniform(keys[0], (len(matrix),), minval=-1.0, maxval=1.0)
+        u, v = (parts[0] + 1j * parts[1] for parts in jax.random.normal(keys[1], (2, 2, len(matrix))))
+        start = _Perturbation(q, u / norms(u), v / norms(v))
+        _, (path, nearness) = jax.lax.scan(partial(ascend, penalty), start, None, length=ASCENT_STEPS)
+        nearness = jnp.where(jnp.isfinite(nearness), nearness, -jnp.inf).at[0].set(jnp.inf)
+        best = jax.lax.top_k(nearness, MADE_REAL)[1]
+        return jnp.max(jax.vmap(lambda i: measure(penalty, jax.tree.map(lambda x: x[i], path)))(best))
 
-    starts = jax.vmap(bound)(jax.random.split(jax.random.key(0), POWER_STARTS))
-    return jnp.max(jnp.where(jnp.isfinite(starts), starts, 0.0))
+    def measure(penalty: Array, delta: _Perturbation) -> Array:
+        delta = jax.lax.fori_loop(0, REAL_STEPS, lambda _, x: make_real(penalty, x), delta)
+        values = jnp.linalg.eigvals(product(delta))
+        size = jnp.maximum(jnp.max(jnp.abs(delta.q) * in_real), 0.0 if is_real.all() else 1.0)
+        is_bound = jnp.isfinite(values) & (jnp.abs(values.imag) <= rounding * jnp.abs(values))
+        return jnp.max(jnp.where(is_bound, jnp.abs(values), 0.0)) / jnp.where(size > 0, size, 1.0)
+
+    starts = jax.vmap(bound)(jax.random.split(jax.random.key(0), ASCENT_STARTS))
+    greatest = jnp.max(starts)
+    return jnp.where(greatest**2 > LEAST_SQUARE * jnp.linalg.norm(matrix, 2) ** 2, greatest, 0.0)
