@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.assess.program import StopProgram
 from diffabs.assess.surfaces import make_surface
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import get, replace
@@ -31,27 +32,6 @@ CURVE = ("c1", "c2", "c3", "c4")
 SOON = 2.0  # s, the time of the first limit of the steering
 HIGH, LOW = (False, False), (True, True)
 Population = Mapping[str, AnyArray]  # parameters of several cars by path, shape (cars,)
-
-
-class StopProgram(NamedTuple):
-    """What the regulation leaves to the test house.
-
-    Attributes:
-        high: Coefficient of adhesion of the good road [1], about 0.8.
-        low: That of the slippery road [1], at most 0.3.
-        load: Mass that a laden car carries [kg], at its centre of gravity.
-        fast: The high speed [km/h].
-        steering_ratio: Angle of the steering wheel per steer angle [1].
-        brief: Longest time for which a wheel may lock above 15 km/h [s]. The regulation allows brief locking without a
-            number; this one is ours.
-    """
-
-    high: Scalar = 0.8
-    low: Scalar = 0.3
-    load: Scalar = 400.0
-    fast: Scalar = 120.0
-    steering_ratio: Scalar = 16.0
-    brief: Scalar = 0.1
 
 
 class RuleStop(NamedTuple):
@@ -100,6 +80,7 @@ def run_stops(
     program: StopProgram,
     population: Population | None = None,
     objectives: Mapping[str, Objective] | None = None,
+    engine: str = "auto",
 ) -> Run:
     """Return the runs of all stops, those of a car after another; also for a traced loop.
 
@@ -110,6 +91,7 @@ def run_stops(
         program: Roads, load and speeds.
         population: Parameters of several cars by path, shape (cars,); without one there is one car.
         objectives: Further metrics by name.
+        engine: Engine of the runs, as in `run_batch`.
 
     Returns:
         Runs with metrics of shape (cars * stops,).
@@ -130,7 +112,8 @@ def run_stops(
     empty = columns.get("plant.mass", get(loop, "plant.mass"))
     columns["plant.mass"] = empty + jnp.tile(program.load * _stack(stop.laden for stop in stops), cars)
     ready = replace(loop, {"plant": plant, "stop": SpeedReached(speed=15 * ONE_KMH)})
-    return run_batch(ready, Batch(columns), solver, {**_objectives(loop.plant, program), **(objectives or {})})
+    measured = {**_objectives(loop.plant, program), **(objectives or {})}
+    return run_batch(ready, Batch(columns), solver, measured, engine=engine)
 
 
 def _plan_load(laden: bool, fast: float, split: bool) -> Iterator[RuleStop]:

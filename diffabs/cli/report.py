@@ -13,10 +13,11 @@ ENDINGS = (".html", ".htm")
 
 
 def report(
-    source: Annotated[
-        pathlib.Path,
+    sources: Annotated[
+        list[pathlib.Path],
         typer.Argument(
-            metavar="DIR|FILE.json", help="Result of reproduce, sweep, rare, tune, identify, prove, design or certify."
+            metavar="DIR|FILE.json...",
+            help="Results of reproduce, sweep, rare, tune, identify, prove, design, assess or certify.",
         ),
     ],
     out: Annotated[
@@ -24,18 +25,21 @@ def report(
         typer.Option("--out", "-o", metavar="FILE.html", help="File to write; default: report.html in the folder."),
     ] = None,
 ) -> None:
-    """Make one HTML file of a result.
+    """Make one HTML file of results. Several of assess are compared, clause by clause.
 
     It has question, answer, figures, tables, certificate, model and provenance."""
     with console.end_on_errors():
         console.need_extra("report")
+        source = sources[0]
+        if not out and len(sources) > 1:
+            console.fail("--out FILE.html is needed for several sources")
         target = out or (source / DEFAULT_NAME if source.is_dir() else source.with_suffix(".html"))
         if target.suffix.lower() not in ENDINGS:
             console.fail(f"--out {target}: the name must end in {' or '.join(ENDINGS)}")
-        if not source.exists():
-            console.fail(f"{source}: there is no such folder or file")
+        if missing := [str(path) for path in sources if not path.exists()]:
+            console.fail(f"{', '.join(missing)}: there is no such folder or file")
         check_target(target)
-        console.run_with_progress(lambda: write_report_file([source], target), "writing the report")
+        console.run_with_progress(lambda: write_report_file(sources, target), "writing the report")
         console.say(f"report: {target}")
 
 

@@ -318,7 +318,7 @@ def build_loop(sections: JsonObject) -> Loop:
 
 
 # Sections of a scenario that are not fields of a loop.
-OTHER_SECTIONS = ("road", "solver", "objective", "design", "tune", "sweep", "title", "description")
+OTHER_SECTIONS = ("road", "solver", "objective", "design", "tune", "sweep", "assess", "title", "description")
 
 
 def join_path(path: str, key: str) -> str:

@@ -8,6 +8,7 @@
     [design]       requirements on a robust gain, and the ranges of parameters: see `section_design`
     [tune]         free parameters, objective, and the runs it is taken over: see `section_tune`
     [sweep]        distributions of a Monte-Carlo sweep, and bounds of a failure: see `section_sweep`
+    [assess]       roads, load and speed of the clauses about anti-lock brakes: see `section_assess`
 
 A section that is left out gets the plant's usual part; it is required if the plant has none. Speeds may be given in
 km/h: `speed_kmh`. A value is never evaluated as code.
@@ -18,7 +19,7 @@ import importlib.resources
 import pathlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -45,7 +46,15 @@ from diffabs.loop.admissible import find_mismatches, find_unstable_step
 from diffabs.loop.closed_loop import Loop
 from diffabs.loop.contracts import find_misfits
 from diffabs.parts.objectives import BRAKING, default_objectives
-from diffabs.scenario import parameter_paths, section_design, section_solver, section_sweep, section_tune, toml
+from diffabs.scenario import (
+    parameter_paths,
+    section_assess,
+    section_design,
+    section_solver,
+    section_sweep,
+    section_tune,
+    toml,
+)
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.registry import (
     FAMILIES,
@@ -58,6 +67,9 @@ from diffabs.scenario.registry import (
     name_of,
     type_name,
 )
+
+if TYPE_CHECKING:
+    from diffabs.assess import StopProgram
 
 MAX_SCENARIO_BYTES = 1_000_000  # bytes of a file
 MAX_WRITTEN_BYTES = 10 * MAX_SCENARIO_BYTES  # bytes of a text in a document, which `dump` writes with all digits
@@ -81,6 +93,7 @@ class Scenario:
         design: Section `[design]`.
         tune: Section `[tune]`.
         sweep: Section `[sweep]`.
+        assess: Section `[assess]`; None without one.
         notes: One line for each override that replaces a part and so removes entries of the sections.
     """
 
@@ -94,6 +107,7 @@ class Scenario:
     design: section_design.DesignTask = dataclasses.field(default_factory=section_design.DesignTask)
     tune: section_tune.Goal = dataclasses.field(default_factory=section_tune.Goal)
     sweep: section_sweep.SweepSection = dataclasses.field(default_factory=section_sweep.SweepSection)
+    assess: "StopProgram | None" = None
     notes: tuple[str, ...] = ()
 
     def key(self) -> jax.Array:
@@ -328,6 +342,7 @@ def _assemble(name: str, table: JsonObject, folder: pathlib.Path, notes: Iterabl
         design=section_design.read_design_section(table.get("design", {}), loop),
         tune=section_tune.read_tune_section(table.get("tune", {}), loop, objectives),
         sweep=section_sweep.read_sweep_section(table.get("sweep", {}), loop, objectives, folder),
+        assess=section_assess.read_assess_section(table.get("assess"), loop),
         notes=tuple(notes),
     )
 
@@ -364,6 +379,7 @@ def dump(scenario: Scenario) -> str:
     sections["solver"] = section_solver.write_solver_section(scenario.solver, scenario.seed)
     sections["objective"] = as_plain(scenario.objectives)
     sections |= {name: getattr(scenario, name).table() for name in ("design", "tune", "sweep")}
+    sections |= section_assess.write_assess_section(scenario.assess)
     return toml.write_toml({key: getattr(scenario, key) for key in TEXTS} | lists, sections)
 
 

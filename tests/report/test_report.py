@@ -63,6 +63,7 @@ class Results:
             "identify": [self.scenario, *still, "--data", self.folder / "run.csv", "--free", "plant.mass=4:8",
                          "--column", "wheel_speed"],
             "rare": [self.scenario, "stop_distance=2.5", "--samples", 100],
+            "assess": ["half-car"],
         }[kind]  # fmt: skip
         with pytest.MonkeyPatch.context() as patch:
             replace_seam(patch, "tune_tune", invented.tuned)  # what it writes is as of a real one
@@ -80,10 +81,10 @@ def results(tmp_path_factory):
     return Results(tmp_path_factory.mktemp("results"))
 
 
-KINDS = ("sweep", "tune", "design", "identify", "rare")
-LONG = ("sweep", "tune", "identify", "rare")
+KINDS = ("sweep", "tune", "design", "identify", "rare", "assess")
+LONG = ("sweep", "tune", "identify", "rare", "assess")
 SOURCES = {"sweep": "sweep", "certificate": "certificate.json", **{kind: f"{kind}.json" for kind in
-           ("tune", "design", "identify", "rare")}}  # fmt: skip
+           ("tune", "design", "identify", "rare", "assess")}}  # fmt: skip
 
 
 def page(results, kind):

@@ -2,7 +2,7 @@
 
 - `documents`: documents of commands, found in a folder or a file
 - `page`: contents of a section, as plain data
-- `studies`, `findings`, `proofs`, `experiments`: a document as a section
+- `studies`, `findings`, `proofs`, `experiments`, `assessments`: a document as a section
 - `writing`: sections as HTML, by the template beside it
 """
 

@@ -19,6 +19,7 @@ KEYS_BY_KIND: dict[str, tuple[str, ...]] = {  # the keys that only this kind has
     "identify": ("values", "residuals", "chi2"),
     "prove": ("verdict", "refuted_by", "share_left"),
     "design": ("gain", "states", "over", "poles"),
+    "assess": ("clauses", "stops", "unfinished"),
     "certificate": ("format", "system", "claims"),
 }
 MODEL = ("model", "model.parts", "model.parameters")
@@ -30,10 +31,11 @@ TABLES_BY_KIND: dict[str, tuple[str, ...]] = {  # the members that are tables, w
     "identify": (*MODEL, "values", "residuals", "data"),
     "prove": (*MODEL, "over", "bounds"),
     "design": (*MODEL, "over", "files"),
+    "assess": (*MODEL, "program", "files"),
     "certificate": ("system",),
 }
 CERTIFICATE_FORMAT = "diffabs certificate"  # a file with another `format` is no document of these
-READABLE_DOCUMENTS = "reproduce, sweep, rare, tune, identify, prove --json, design and certify write"
+READABLE_DOCUMENTS = "reproduce, sweep, rare, tune, identify, prove --json, design, assess and certify write"
 
 
 class ReportError(ScenarioError):

@@ -2,13 +2,13 @@
 
 import importlib.resources
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from diffabs import __version__
 from diffabs.host import files
 from diffabs.host.documents import DocumentError
 from diffabs.host.values import ScenarioError, make_printable
-from diffabs.output.report import experiments, findings, proofs, studies
+from diffabs.output.report import assessments, experiments, findings, proofs, studies
 from diffabs.output.report.documents import Document, ReportError, check_tables, find_documents
 from diffabs.output.report.page import Section, shown_numbers
 
@@ -22,12 +22,14 @@ SECTION_BY_KIND: dict[str, Callable[[Document], Section]] = {
     "identify": findings.identification_section,
     "prove": proofs.box_section,
     "design": proofs.design_section,
+    "assess": assessments.assessment_section,
     "certificate": proofs.certificate_section,
 }
+COMPARISON_BY_KIND: dict[str, Callable[[Sequence[Document]], Section]] = {"assess": assessments.comparison_section}
 
 
 def build_report(documents: Sequence[Document], title: str = "") -> str:
-    """Return a report of documents as HTML, with one section each.
+    """Return a report of documents as HTML, with one section each. Several of a kind are compared before, if possible.
 
     Args:
         documents: Documents of the commands.
@@ -38,13 +40,14 @@ def build_report(documents: Sequence[Document], title: str = "") -> str:
     """
     import jinja2
 
-    sections = [_section(document) for document in documents]
+    own = [_section(document) for document in documents]  # first: it names the document that cannot be read
+    sections = [*_compare(documents), *own]
     text = (importlib.resources.files("diffabs.output.report") / "report.html.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
     environment.filters |= {"numbers": shown_numbers, "printable": make_printable}
-    whole = title or (sections[0].title if len(sections) == 1 else f"{len(sections)} results")
+    whole = title or (sections[0].title if len(sections) == 1 else f"{len(documents)} results")
     try:
         return environment.from_string(text).render(title=whole, sections=sections, version=__version__)
     except RecursionError:  # lists in lists
@@ -68,6 +71,14 @@ def write_report(sources: Sequence[pathlib.Path], target: pathlib.Path, title: s
     text = build_report([document for source in sources for document in find_documents(source)], title)
     # Half of a surrogate pair (in JSON, in a file name) has no UTF-8; readers of HTML show its reference as U+FFFD.
     files.write_file(target, text.encode(errors="xmlcharrefreplace"))
+
+
+def _compare(documents: Sequence[Document]) -> Iterator[Section]:
+    """Yield a section for each kind of which there are several documents that can be compared."""
+    for kind, compare in COMPARISON_BY_KIND.items():
+        alike = [document for document in documents if document.kind == kind]
+        if len(alike) > 1:
+            yield compare(alike)
 
 
 def _section(document: Document) -> Section:
