@@ -4,6 +4,7 @@
     surfaces   roads with a coefficient of adhesion k
     runs       the stops that the clauses ask for, as one batch
     clauses    the figure of each clause, its limit and its verdict
+    bounds     clauses as constraints of a tuning
 
 Source: Regulation (EU) 2015/68, Annex XI (anti-lock brakes of agricultural vehicles), read in full; 49 CFR 571.122 for
 the time of a rise. That other regulations number their clauses alike was not confirmed.
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING
 from diffabs.host.exports import lazy_getattr
 
 if TYPE_CHECKING:
+    from diffabs.assess.bounds import ClauseBounds as ClauseBounds
     from diffabs.assess.clauses import Assessment as Assessment
     from diffabs.assess.clauses import Clause as Clause
     from diffabs.assess.clauses import Figures as Figures

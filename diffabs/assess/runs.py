@@ -67,10 +67,15 @@ def tyre_fields(plant: Part) -> tuple[str, ...]:
     return names
 
 
+def has_two_sides(plant: Part) -> bool:
+    """Return whether a plant has tyres on the left and on the right. Raises ValueError for a plant without any."""
+    return any("left" in name for name in tyre_fields(plant))
+
+
 def plan_stops(plant: Part, program: StopProgram) -> list[RuleStop]:
     """Return the stops of the clauses: unladen, then laden. A split road needs a car with two sides."""
-    split = any("left" in name for name in tyre_fields(plant))
-    return [stop for laden in (False, True) for stop in _plan_load(laden, float(program.fast), split)]
+    split, fast = has_two_sides(plant), float(program.fast)
+    return [stop for laden in (False, True) for stop in _plan_load(laden, fast, split)]
 
 
 def run_stops(

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING
 
 from diffabs.core.types import JsonObject
 from diffabs.core.validity import find_problems
-from diffabs.host.values import ScenarioError, plain_fields, read_table
+from diffabs.host.values import ScenarioError, choice_reader, format_given, list_reader, plain_fields, read_table
 from diffabs.loop.closed_loop import Loop
+
+ALL = "all"  # clauses that a plant can meet
 
 if TYPE_CHECKING:
     from diffabs.assess import StopProgram
@@ -35,6 +37,22 @@ def read_assess_section(table: object, loop: Loop) -> "StopProgram | None":
     if lines := list(find_problems(program, "assess.")):
         raise ScenarioError("; ".join(lines))
     return program
+
+
+def read_clauses(value: object, path: str, loop: Loop) -> tuple[str, ...]:
+    """Return the numbers of the clauses in a list, or all that a loop's plant can meet for the text "all"."""
+    from diffabs.assess.program import OF_A_SPLIT_ROAD, OF_ONE_TRACK
+    from diffabs.assess.runs import has_two_sides
+
+    try:
+        known = OF_ONE_TRACK + (OF_A_SPLIT_ROAD if has_two_sides(loop.plant) else ())
+    except ValueError as error:
+        raise ScenarioError(f"{path}: {error}") from None
+    if value == ALL:
+        return known
+    if isinstance(value, str):
+        raise ScenarioError(f'{path} = {format_given(value)}: "{ALL}" or a list of {", ".join(known)} is needed')
+    return list_reader(choice_reader(*known))(value, path)
 
 
 def write_assess_section(program: "StopProgram | None") -> dict[str, JsonObject]:

@@ -6,6 +6,7 @@
                      between the smallest and the greatest of each, or in an interval { low, high }
     decay            1/s that shall be certified over [design.over]; 0 for none
     damping          of the poles of the linear systems there, in [0, 1); 0 for none
+    clauses          numbers of the clauses about anti-lock brakes that the car meets, or "all": see `section_assess`
     [tune.free]
     "controller.gain" = { low = [-1e5, -300.0], high = [-100.0, -15.0] }     # lists where the parameter is one, in SI
     "reference.time_constant" = "declared"                   # the declared range
@@ -69,6 +70,7 @@ from diffabs.scenario.parameter_paths import (
     read_entries,
 )
 from diffabs.scenario.registry import unit_of
+from diffabs.scenario.section_assess import read_clauses
 from diffabs.tune import risk
 
 DECLARED_RANGE = "declared"
@@ -147,6 +149,7 @@ class Goal:
         samples: Number of runs of the Latin hypercube; 0 for every combination.
         decay: Required certified decay rate [1/s]; 0 for none.
         damping: Required damping of the poles, in [0, 1); 0 for none.
+        clauses: Numbers of the clauses of [assess] that the loop shall meet.
         free: Ranges by path; None for the declared range.
         objective: Weights by metric.
         over: Values by path.
@@ -161,6 +164,7 @@ class Goal:
     samples: int = table_field(whole_reader(0, MOST_LANES), 0)
     decay: float = table_field(range_reader(ParameterSpec("1/s", low=0.0)), 0.0)
     damping: float = table_field(range_reader(ParameterSpec("1", low=0.0, high=1.0, open_high=True)), 0.0)
+    clauses: tuple[str, ...] = ()
     free: Mapping[str, Ends | None] = dataclasses.field(default_factory=dict)
     objective: Mapping[str, float] = dataclasses.field(default_factory=dict)
     over: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
@@ -223,6 +227,7 @@ def read_tune_section(table: object, loop: Loop, objectives: Mapping[str, Object
         free=lambda value, path: free_ranges(table_reader(read_as_given, "ranges")(value, path), loop, path),
         over=lambda value, path: _over(table_reader(read_as_given, "values")(value, path), loop, bool(samples)),
         objective=metric_reader(objectives, "weights of metrics"),
+        clauses=lambda value, path: read_clauses(value, path, loop) if value else (),
         constraints=functools.partial(read_table, FrequencyConstraints),
         limits=metric_reader(
             objectives, "greatest values of metrics", lambda objective: unit_of(objective, loop.plant)

@@ -1,5 +1,6 @@
 """The task of a tuning, and the JSON values of its result."""
 
+import dataclasses
 import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,12 +21,14 @@ from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.section_tune import FrequencyConstraints
 
 if TYPE_CHECKING:
+    from diffabs.assess import Clause, ClauseBounds
     from diffabs.robust.design.loop_task import ProofTask
     from diffabs.tune import FrequencyBounds, Method, Tuned
     from diffabs.tune.problem import Problem
 
 WHEN = ("before", "after")
 MARGIN_CONSTRAINTS = "margins"  # name of the constraints of [tune.constraints]
+CLAUSE_CONSTRAINTS = "clauses"  # name of the clauses of [tune]
 
 
 class Work(NamedTuple):
@@ -70,6 +73,8 @@ def build_work(scenario: Scenario) -> Work:
         constraints["damping"] = Poles(task.polytope, damping=goal.damping)
     if goal.constraints.bounds():
         constraints[MARGIN_CONSTRAINTS] = build_frequency_bounds(scenario)
+    if goal.clauses:
+        constraints[CLAUSE_CONSTRAINTS] = build_clause_bounds(scenario)
     return Work(scenario, batch, constraints, task)
 
 
@@ -101,6 +106,26 @@ def build_frequency_bounds(scenario: Scenario) -> "FrequencyBounds":
     return bounds
 
 
+def build_clause_bounds(scenario: Scenario) -> "ClauseBounds":
+    """Return the clauses of [tune], for the stops of [assess].
+
+    Raises:
+        ScenarioError: A clause has no finite figure at the start, so that the search has no derivative.
+    """
+    from diffabs.assess import ClauseBounds, StopProgram
+
+    bounds = ClauseBounds(scenario.tune.clauses, scenario.solver, scenario.assess or StopProgram())
+    for clause in bounds.judge(scenario.loop):
+        if clause.diverged:
+            why = f"{clause.diverged} runs diverge or do not reach 15 km/h"
+        elif not math.isfinite(clause.figure):
+            why = f"the {clause.rule} is not finite, in {clause.stop}"
+        else:
+            continue
+        raise ScenarioError(f"tune.clauses: {clause.number} has no derivative at the start: {why}")
+    return bounds
+
+
 def _check_reachable(section: FrequencyConstraints, loop: Loop) -> None:
     """Raise a ValueError for a bound that no loop of this kind meets, or for poles that a pure delay multiplies."""
     from diffabs.linear.responses import open_transfer
@@ -120,7 +145,9 @@ def build_tuning(work: Work, engine: str = "auto") -> "Problem":
     """Return the problem of a tuning, for `tune.tune` with the `engine` of its runs."""
     from diffabs import tune
 
-    goal = work.scenario.tune
+    goal, constraints = work.scenario.tune, dict(work.constraints)
+    if clauses := constraints.get(CLAUSE_CONSTRAINTS):
+        constraints[CLAUSE_CONSTRAINTS] = dataclasses.replace(clauses, engine=engine)
     return tune.build_problem(
         work.scenario.loop,
         free=goal.free,
@@ -129,7 +156,7 @@ def build_tuning(work: Work, engine: str = "auto") -> "Problem":
         solver=work.scenario.solver,
         measured=work.scenario.objectives,
         aggregate=goal.read_aggregate(),
-        constraints=list(work.constraints.values()),
+        constraints=list(constraints.values()),
         engine=engine,
     )
 
@@ -175,7 +202,7 @@ def with_unproved(work: Work, result: JsonObject) -> JsonObject:
     unseen = [
         {"name": name, "bound": bounds[name], "before": None, "after": None, "met": False, "missed": None}
         for name in work.constraints
-        if name not in names and name != MARGIN_CONSTRAINTS
+        if name in bounds and name not in names
     ]
     return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
 
@@ -208,6 +235,9 @@ def _constraints(work: Work, tuned: "Tuned", proved: Proved) -> list[JsonObject]
         before, after = bounds.worst(work.scenario.loop), bounds.worst(tuned.loop)
         for name, bound in bounds.bounds.items():
             rows.append(_constraint_row(name, bound, before[name], after[name], at_most=name in AT_MOST))
+    if clauses := work.constraints.get(CLAUSE_CONSTRAINTS):
+        pairs = zip(*(clauses.judge(loop) for loop in (work.scenario.loop, tuned.loop)), strict=True)
+        rows += [describe_clause(before, after) for before, after in pairs]
     if work.task and goal.decay:
         before, after = work.task.certify().decay_rate, proved.document["decay_rate"]
         rows.append(_constraint_row("certified decay", goal.decay, before, after, at_most=False))
@@ -228,6 +258,12 @@ def _constraint_row(name: str, bound: float, before: float | None, after: float 
     missed = None if math.isnan(beyond) else max(beyond, 0.0)
     row = {"name": name, "bound": bound, "before": before, "after": after}
     return {**row, "met": beyond <= 0, "missed": missed}
+
+
+def describe_clause(before: "Clause", after: "Clause") -> JsonObject:
+    """Return the row of a clause; an undecided one has no figure, so that it does not count as met."""
+    figures = (math.nan if clause.verdict == "undecided" else clause.figure for clause in (before, after))
+    return _constraint_row(f"{after.number} {after.rule}", after.limit, *figures, at_most=not after.at_least)
 
 
 def _least_damping(task: "ProofTask", loop: Loop) -> float:
