@@ -3,6 +3,7 @@
     program    what the regulation leaves to the test house
     surfaces   roads with a coefficient of adhesion k
     runs       the stops that the clauses ask for, as one batch
+    adhesion   the coefficient of adhesion, measured by braking one axle
     clauses    the figure of each clause, its limit and its verdict
     bounds     clauses as constraints of a tuning
 
@@ -15,6 +16,9 @@ from typing import TYPE_CHECKING
 from diffabs.host.exports import lazy_getattr
 
 if TYPE_CHECKING:
+    from diffabs.assess.adhesion import AxleAdhesion as AxleAdhesion
+    from diffabs.assess.adhesion import find_axle_adhesion as find_axle_adhesion
+    from diffabs.assess.adhesion import measure_adhesion as measure_adhesion
     from diffabs.assess.bounds import ClauseBounds as ClauseBounds
     from diffabs.assess.clauses import Assessment as Assessment
     from diffabs.assess.clauses import Clause as Clause
@@ -29,5 +33,6 @@ if TYPE_CHECKING:
     from diffabs.assess.runs import run_stops as run_stops
     from diffabs.assess.surfaces import make_surface as make_surface
     from diffabs.assess.surfaces import peak_friction as peak_friction
+    from diffabs.assess.surfaces import peak_slip as peak_slip
 
 __getattr__ = lazy_getattr(__name__)

@@ -1,7 +1,7 @@
 """The clauses of the regulation: the figure of each in the runs, its limit, and the verdict.
 
     z = 0.849/t        braking rate of the car from 45 to 15 km/h in t seconds (30/3.6/9.81 = 0.849)
-    epsilon = z/k      utilised adhesion; the surfaces give k exactly, where a test house measures it with one axle
+    epsilon = z/k      utilised adhesion; the surfaces give k exactly, or k is measured with one axle (`adhesion`)
 
 Three figures of the split road stand in no text that was read, and are marked: z >= 0.75 (4 kL + kH)/5, z >= kL, and
 the lateral position. Its limit is ours: half of the room that a lane of 3.5 m leaves a car of 1.75 m. Without it a car
@@ -14,6 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.assess.adhesion import AxleAdhesion, measure_adhesion
 from diffabs.assess.program import StopProgram
 from diffabs.assess.runs import ONE_KMH, Population, RuleStop, plan_stops, run_stops, tyre_fields
 from diffabs.core.types import Array, JsonObject, Scalar
@@ -176,15 +177,28 @@ def evaluate_clauses(
     solver = dataclasses.replace(solver, duration=max(float(solver.duration), float(slowest)))
     runs = run_stops(loop, solver, stops, program, population, engine=engine)
     failed = jnp.reshape(jnp.asarray(runs.diverged) | ~jnp.asarray(runs.stopped), (-1, len(stops)))
-    return clause_figures(runs, stops, program), failed
+    measured = measure_adhesion(loop, solver, program, population, engine) if program.adhesion == "axles" else None
+    return clause_figures(runs, stops, program, measured), failed
 
 
-def clause_figures(runs: Run, stops: list[RuleStop], program: StopProgram) -> list[Figures]:
-    """Return the figures of all clauses, differentiable by whatever the `runs` of `run_stops` depend on."""
+def clause_figures(
+    runs: Run, stops: list[RuleStop], program: StopProgram, measured: AxleAdhesion | None = None
+) -> list[Figures]:
+    """Return the figures of all clauses, differentiable by whatever the `runs` of `run_stops` depend on.
+
+    Args:
+        runs: Runs of all stops.
+        stops: Stops of each car.
+        program: Roads, load, speed and limits.
+        measured: Coefficients of adhesion of each axle (`measure_adhesion`), in place of those of the roads.
+    """
     metrics = {name: jnp.reshape(value, (-1, len(stops))) for name, value in runs.metrics.items()}
     locked = jnp.max(jnp.stack([value for name, value in metrics.items() if name.startswith("locked_")]), axis=0)
     rate = RATE / metrics["time"]
     adhesion = jnp.stack([jnp.asarray(program.low if stop.left_side[0] else program.high, float) for stop in stops])
+    used, origin = rate / adhesion, ""
+    if measured:
+        used, origin = rate / measured.weigh(rate, stops), ", k by one axle"
 
     def row(
         number: str, rule: str, kind: str, values: Array, limit: Scalar, unit: str, at_least: bool = False
@@ -193,7 +207,7 @@ def clause_figures(runs: Run, stops: list[RuleStop], program: StopProgram) -> li
         return Figures(number, rule, values[:, jnp.asarray(places)], limit, unit, at_least, places)
 
     rows = [
-        row("5.2.1", "utilised adhesion from 55 km/h", "adhesion", rate / adhesion, 0.75, "1", at_least=True)._replace(
+        row("5.2.1", f"utilised adhesion from 55 km/h{origin}", "adhesion", used, 0.75, "1", at_least=True)._replace(
             repeat_above=GREATEST_USE
         ),
         row("5.3.1", "time locked under full braking", "lock", locked, program.brief, "s"),
@@ -223,7 +237,8 @@ def judge_clause(figures: Figures, stops: list[RuleStop], failed: np.ndarray) ->
         stops: Stops of each car.
         failed: Runs that diverged or did not end, shape (cars, stops); they count neither as met nor as not met.
     """
-    values, missed = np.asarray(figures.values), failed[:, list(figures.places)]
+    values = np.asarray(figures.values)
+    missed = failed[:, list(figures.places)] | np.isnan(values)  # NaN: a run that measures k failed
     finished = np.where(missed, np.nan, values)
     worst = np.full_like(finished, np.inf if figures.at_least else -np.inf)
     worst = np.where(np.isnan(finished), worst, finished)

@@ -3,12 +3,14 @@
 from collections.abc import Iterator
 
 from diffabs.core.arrays import as_rule_array
-from diffabs.core.pytree import param, pytree
+from diffabs.core.pytree import param, pytree, static
 from diffabs.core.rules import Rule
 from diffabs.core.types import Scalar
 
 OF_ONE_TRACK = ("5.2.1", "5.3.1", "5.3.2", "5.3.3")
 OF_A_SPLIT_ROAD = ("5.3.4", "5.3.7")
+ADHESION_SOURCES = ("road", "axles")
+DRIVEN = ("front", "rear", "both")
 
 
 @pytree
@@ -32,6 +34,16 @@ class StopProgram:
     """Angle of the steering wheel per steer angle."""
     brief: Scalar = param(default=0.1, unit="s", low=0.0, high=10.0)
     """Longest time for which a wheel may lock above 15 km/h; the regulation allows brief locking without a number."""
+    adhesion: str = static(default="road")
+    """Coefficient k of the utilised adhesion: that of the `road`, or measured with one axle at a time: `axles`."""
+    driven: str = static(default="rear")
+    """Driven axle, `front`, `rear` or `both`: its rolling resistance counts in a measured k."""
+
+    def problems(self) -> Iterator[str]:
+        """Yield a line for an unknown name."""
+        for field, names in (("adhesion", ADHESION_SOURCES), ("driven", DRIVEN)):
+            if getattr(self, field) not in names:
+                yield f"{field} = {getattr(self, field)} is unknown; there is {', '.join(names)}"
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rule that the good road has at least twice the adhesion of the slippery one."""

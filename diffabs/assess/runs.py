@@ -86,6 +86,7 @@ def run_stops(
     population: Population | None = None,
     objectives: Mapping[str, Objective] | None = None,
     engine: str = "auto",
+    per_stop: Population | None = None,
 ) -> Run:
     """Return the runs of all stops, those of a car after another; also for a traced loop.
 
@@ -97,6 +98,7 @@ def run_stops(
         population: Parameters of several cars by path, shape (cars,); without one there is one car.
         objectives: Further metrics by name.
         engine: Engine of the runs, as in `run_batch`.
+        per_stop: Further parameters of each stop by path, shape (stops,).
 
     Returns:
         Runs with metrics of shape (cars * stops,).
@@ -114,6 +116,7 @@ def run_stops(
         columns[f"plant.{name}.road.edges"] = jnp.tile(_stack(stop.edge for stop in stops), cars)[:, None]
     columns["initial.speed"] = jnp.tile(ONE_KMH * _stack(stop.speed for stop in stops), cars)
     columns |= {path: jnp.repeat(jnp.asarray(column), len(stops)) for path, column in population.items()}
+    columns |= {path: jnp.tile(jnp.asarray(column), cars) for path, column in (per_stop or {}).items()}
     empty = columns.get("plant.mass", get(loop, "plant.mass"))
     columns["plant.mass"] = empty + jnp.tile(program.load * _stack(stop.laden for stop in stops), cars)
     ready = replace(loop, {"plant": plant, "stop": SpeedReached(speed=15 * ONE_KMH)})

@@ -18,8 +18,12 @@ def peak_friction(road: Burckhardt) -> Scalar:
     >>> print(f"{peak_friction(DRY_ASPHALT):.4f}")
     1.1702
     """
-    slip = jnp.log(road.c1 * road.c2 / road.c3) / road.c2
-    return road.c1 - road.c3 / road.c2 - road.c3 * slip
+    return road.c1 - road.c3 / road.c2 - road.c3 * peak_slip(road)
+
+
+def peak_slip(road: Burckhardt) -> Scalar:
+    """Return the slip of the greatest friction of a curve [1]."""
+    return jnp.log(road.c1 * road.c2 / road.c3) / road.c2
 
 
 def make_surface(adhesion: Scalar, slippery: bool) -> Burckhardt:

@@ -30,6 +30,9 @@ def assess_brakes(
         float | None, typer.Option(help="Angle of the steering wheel per steer angle: 16.")
     ] = None,
     brief: Annotated[float | None, typer.Option(help="Longest time for which a wheel may lock [s]: 0.1.")] = None,
+    adhesion: Annotated[
+        str | None, typer.Option(help="k of the utilised adhesion: road, or axles for one measured with one axle.")
+    ] = None,
     cars: Annotated[
         int, typer.Option(min=0, max=MOST_CARS, help="Assess this number of cars, drawn from [sweep.over].")
     ] = 0,
@@ -46,7 +49,7 @@ def assess_brakes(
         from diffabs.assess.runs import tyre_fields
         from diffabs.scenario.section_sweep import build_study
 
-        options = {"high": high, "low": low, "load": load, "fast": fast, "brief": brief}
+        options = {"high": high, "low": low, "load": load, "fast": fast, "brief": brief, "adhesion": adhesion}
         changes = console.add_option_overrides(changes, "assess", **options, steering_ratio=steering_ratio)
         setup = console.load_scenario(scenario, changes)
         try:

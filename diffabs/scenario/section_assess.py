@@ -5,6 +5,8 @@
     fast              km/h, the high speed
     steering_ratio    angle of the steering wheel per steer angle
     brief             s, the longest time for which a wheel may lock
+    adhesion          k of the utilised adhesion: "road", or "axles" for one measured by braking one axle at a time
+    driven            driven axle, "front", "rear" or "both", whose rolling resistance counts in a measured k
 
 `diffabs assess` runs its stops; [tune] takes the clauses as constraints. It is for plants with tyres on roads.
 """
@@ -45,14 +47,14 @@ def read_clauses(value: object, path: str, loop: Loop) -> tuple[str, ...]:
     from diffabs.assess.runs import has_two_sides
 
     try:
-        known = OF_ONE_TRACK + (OF_A_SPLIT_ROAD if has_two_sides(loop.plant) else ())
+        numbers = OF_ONE_TRACK + (OF_A_SPLIT_ROAD if has_two_sides(loop.plant) else ())
     except ValueError as error:
         raise ScenarioError(f"{path}: {error}") from None
     if value == ALL:
-        return known
+        return numbers
     if isinstance(value, str):
-        raise ScenarioError(f'{path} = {format_given(value)}: "{ALL}" or a list of {", ".join(known)} is needed')
-    return list_reader(choice_reader(*known))(value, path)
+        raise ScenarioError(f'{path} = {format_given(value)}: "{ALL}" or a list of {", ".join(numbers)} is needed')
+    return list_reader(choice_reader(*numbers))(value, path)
 
 
 def write_assess_section(program: "StopProgram | None") -> dict[str, JsonObject]:

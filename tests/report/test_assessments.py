@@ -42,7 +42,7 @@ def folder(tmp_path):
 
 
 @killed_by("output.report.assessments", 'row["verdict"] == "met"', 'row["verdict"] != "not met" or True')
-@killed_by("output.report.assessments", '"at least" if row', '"at most" if row')
+@killed_by("output.report.assessments", "'at least' if row", "'at most' if row")
 def test_several_cars_are_compared_clause_by_clause(folder):
     page = Page(build_report(find_documents(folder)))
     assert page.headings.index("2 cars on the same clauses") < page.headings.index("Clauses of bad car")

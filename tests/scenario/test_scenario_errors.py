@@ -181,7 +181,7 @@ BAD = [
     ("design.over={'plant.mass'=[5,6],plant={mass=[5,6]}}", "design.over.plant.mass is given twice"),
     ("design.over={'initial.speed'=[1,2],'initial.speed_kmh'=[1,2]}", "is given twice, in m/s and in km/h"),
     ("design.over=" + "{a=" * 20 + "1" + "}" * 20, "design.over", "nested more than 16 deep"),
-    ("tune=3", "tune = 3 is a number", "a table of starts, seed, iterations, samples, decay, damping, free"),
+    ("tune=3", "tune = 3 is a number", "a table of starts, seed, iterations, samples, decay, damping, clauses, free"),
     ("tune.start=2", "tune.start is not a field of tune", "did you mean starts?"),
     ("tune.starts=0", "tune.starts = 0 is outside [1, 1000]"),
     ("tune.starts=1.5", "tune.starts = 1.5 is a number", "a whole number in [1, 1000]"),

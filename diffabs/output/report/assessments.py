@@ -16,9 +16,9 @@ from diffabs.output.report.page import (
 )
 
 REGULATION = "Regulation (EU) 2015/68, Annex XI"
-COLUMNS = ("figure", "limit", "verdict", "worst stop")
+CLAUSE_COLUMNS = ("figure", "limit", "verdict", "worst stop")
 OWN_RULE = "own rule"  # in place of a clause's number
-UNCONFIRMED = f"A row with the number {OWN_RULE} is not from the regulation, and counts for no verdict."
+OWN_RULES_NOTE = f"A row with the number {OWN_RULE} is not from the regulation, and counts for no verdict."
 
 
 def assessment_section(document: Document) -> Section:
@@ -35,11 +35,11 @@ def assessment_section(document: Document) -> Section:
         tables=[
             ReportTable(
                 "Clauses",
-                ("clause", "rule", *COLUMNS),
+                ("clause", "rule", *CLAUSE_COLUMNS),
                 [[row["number"] or OWN_RULE, row["rule"], *_cells(row)] for row in clauses],
             )
         ],
-        notes=[*_notes(clauses), *([] if all(row["confirmed"] for row in clauses) else [UNCONFIRMED])],
+        notes=[*_notes(clauses), *([] if all(row["confirmed"] for row in clauses) else [OWN_RULES_NOTE])],
         provenance=describe_origin(content, program=format_pairs(content["program"])),
         command=content["made"]["command"],
     )
@@ -68,7 +68,7 @@ def comparison_section(documents: Sequence[Document]) -> Section:
             *(
                 ReportTable(
                     _name(first[key]),
-                    ("car", *COLUMNS),
+                    ("car", *CLAUSE_COLUMNS),
                     [[title, *_cells(clauses[key])] for title, clauses in rows.items() if key in clauses],
                 )
                 for key in keys
@@ -77,7 +77,7 @@ def comparison_section(documents: Sequence[Document]) -> Section:
         notes=[
             *(f"{title}: {note}" for title, clauses in rows.items() for note in _notes(clauses.values())),
             *(f"{title}: {_describe_runs(content)}" for title, content in contents.items() if content["unfinished"]),
-            *([] if all(row["confirmed"] for row in first.values()) else [UNCONFIRMED]),
+            *([] if all(row["confirmed"] for row in first.values()) else [OWN_RULES_NOTE]),
             *(["The programs of the stops differ: compare with care."] if len(programs) > 1 else []),
         ],
         model_note="The model of each is below.",
@@ -99,7 +99,7 @@ def _name(row: Table) -> str:
 
 
 def _cells(row: Table) -> list[PyTree]:
-    """Return the cells of `COLUMNS`; JSON has null for a figure that is infinite, or unknown."""
+    """Return the cells of `CLAUSE_COLUMNS`; JSON has null for a figure that is infinite, or unknown."""
     figure = "not finite" if row["figure"] is None else row["figure"]
     return [figure, _limit(row), row["verdict"], row["stop"]]
 

@@ -40,8 +40,9 @@ def build_report(documents: Sequence[Document], title: str = "") -> str:
     """
     import jinja2
 
-    own = [_section(document) for document in documents]  # first: it names the document that cannot be read
-    sections = [*_compare(documents), *own]
+    # Each first: its error names the document that cannot be read.
+    sections = [_section(document) for document in documents]
+    sections = [*_compare(documents), *sections]
     text = (importlib.resources.files("diffabs.output.report") / "report.html.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
