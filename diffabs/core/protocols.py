@@ -52,6 +52,7 @@ Optional methods or attributes of a part's class, beyond its contract:
     output         highest                              greatest possible value of the first output
                    tracked = ("level_1", ...)           outputs that have a target, instead of the first one
                    channel(name), with_channel(...)     the outputs that a part for one channel sees, and back
+    tyre           relax(contact, slip, angle, speed)   d(contact)/dt of a tyre whose force follows the slip: `Contact`
     stop           otherwise = "..."                    note to the reader on a run that ended without success
     objective      physical = (low, high)               range of the value of a physically possible run
                    failure = 0.0                        a run with a greater value has failed
@@ -101,6 +102,18 @@ class TyreForces(NamedTuple):
 
     braking: Scalar
     lateral: Scalar
+
+
+class Contact(NamedTuple):
+    """What the force of a tyre with a relaxation length follows; a state of the plant.
+
+    Attributes:
+        slip: Slip of the contact [1].
+        slip_angle: Its slip angle [rad].
+    """
+
+    slip: Scalar
+    slip_angle: Scalar
 
 
 class Tyre(Protocol):

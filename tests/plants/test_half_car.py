@@ -149,7 +149,7 @@ def test_without_height_it_is_a_quarter_car():
     for speed, slip in ((30.0, 0.0), (20.0, 0.07), (2.0, 0.8)):
         wheel = quarter.derivative(0.0, quarter.start(BrakeStart(speed=speed, slip=slip)), 500.0)
         both = rates(car, car.start(BrakeStart(speed=speed, slip=slip)), AxleBrakes(500.0, 500.0))
-        np.testing.assert_allclose(both, (wheel.speed, wheel.spin, wheel.spin, wheel.distance), rtol=1e-13)
+        np.testing.assert_allclose(both[:4], (wheel.speed, wheel.spin, wheel.spin, wheel.distance), rtol=1e-13)
     pid = controllers.PID(kp=8e3, ki=6e4, low=0.0, high=3e3)
     parts = {"initial": BrakeStart(speed=20.0), "stop": stops.SpeedReached(speed=5.0)}
     target = references.FilteredSlip(slip=0.08)
@@ -179,10 +179,10 @@ def test_the_energy_of_a_run_is_the_work_of_brakes_slip_and_drag():
         rear = CAR.rear_tyre.braking_force(y.rear_slip, y.rear_load, y.speed, y.distance - wheelbase)
         slip = front * (y.speed - y.front_wheel_speed) + rear * (y.speed - y.rear_wheel_speed)
         drag = CAR.drag * y.speed**3 + CAR.rolling * CAR.mass * GRAVITY * y.speed
-        return jnp.stack([*rate, brakes, slip, drag])
+        return jnp.stack([*rate[:4], brakes, slip, drag])
 
     start = CAR.start(BrakeStart(speed=30.0))
-    run = solve_ivp(powers, (0.0, 2.5), [*map(float, start), 0.0, 0.0, 0.0], method="LSODA", rtol=1e-11, atol=1e-9)
+    run = solve_ivp(powers, (0.0, 2.5), [*map(float, start[:4]), 0.0, 0.0, 0.0], method="LSODA", rtol=1e-11, atol=1e-9)
     end = run.y[:, -1]
     lost = CAR.energy(start) - CAR.energy(HalfCarState(*end[:4]))
     assert min(end[1:7]) > 1.0
@@ -237,7 +237,7 @@ def test_rates_are_finite_in_every_corner(tyres):
     for v, front, rear in ((0.0, 0.0, 0.0), (0.0, 5.0, 0.0), (5.0, 0.0, 80.0), (1e-9, 1e-9, 0.0)):
         state = HalfCarState(v, front, rear, 0.0)
         rate, slopes = rates(car, state, AxleBrakes(50.0, 0.0)), jax.jacfwd(car.output)(state)
-        assert np.all(np.isfinite([*rate, *jax.tree.leaves(slopes)]))
+        assert np.all(np.isfinite([*rate[:4], *jax.tree.leaves(slopes)]))
         assert car.project(car.project(state)) == car.project(state)
 
 

@@ -228,9 +228,14 @@ WITH_CHANNELS: dict[str, dict[str, Any]] = {
     "plant": {
         "quadruple tank": plants.QuadrupleTank(share_1=0.43, share_2=0.34),
         "half car": plants.HalfCar(drag=0.4, rolling=0.01, rear_tyre=roads.PacejkaTyre(grip=0.7)),
+        "half car, relaxed": plants.HalfCar(front_tyre=roads.RelaxedTyre()),
         "car": plants.Car(drag=0.4, rolling=0.01, front_left_tyre=roads.PacejkaTyre(grip=0.7)),
     },
-    "tyre": {"on a road": roads.RoadTyre(road=roads.WET_ASPHALT), "pacejka": roads.PacejkaTyre(grip=0.7)},
+    "tyre": {
+        "on a road": roads.RoadTyre(road=roads.WET_ASPHALT),
+        "pacejka": roads.PacejkaTyre(grip=0.7),
+        "relaxed": roads.RelaxedTyre(tyre=roads.PacejkaTyre(grip=0.7), length=0.2),
+    },
     "initial": {"filled": plants.TankStart(level_1=0.1)},
     "controller": {
         "per channel": controllers.PerChannel({"pump_1": _PID, "pump_2": controllers.Relay()}, TANK),

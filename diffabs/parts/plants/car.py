@@ -31,12 +31,22 @@ import jax.numpy as jnp
 
 from diffabs.core.channels import put_first
 from diffabs.core.numerics import larger, quotient
-from diffabs.core.protocols import BrakeOutput, Objective, Tyre, TyreForces
+from diffabs.core.protocols import BrakeOutput, Contact, Objective, Tyre, TyreForces
 from diffabs.core.pytree import param, part, pytree, static
 from diffabs.core.types import Any, PyTree, Scalar
 from diffabs.parts.controllers import PID, Clamping, HoldCourse, NoFeedforward, PerChannel, SelectLow
 from diffabs.parts.objectives import InChannel, LockedTime, PeakOutput, StopDistance, StopTime
-from diffabs.parts.plants.wheel import GRAVITY, BrakeStart, SlipProbes, forward_speed, halt_at_zero, slip_ratio
+from diffabs.parts.plants.wheel import (
+    GRAVITY,
+    BrakeStart,
+    SlipProbes,
+    contact_rate,
+    forward_speed,
+    halt_at_zero,
+    least_contact,
+    settled_contact,
+    slip_ratio,
+)
 from diffabs.parts.references import FilteredSlip, PerTarget
 from diffabs.parts.roads import RoadTyre
 from diffabs.parts.stops import Standstill
@@ -56,7 +66,9 @@ class Wheels(NamedTuple):
 
 
 class CarState(NamedTuple):
-    """Position [m], yaw [rad], velocities [m/s], yaw velocity [rad/s], steer angle [rad], spins of wheels [rad/s]."""
+    """Position [m], yaw [rad], velocities [m/s], yaw velocity [rad/s], steer angle [rad], spins of wheels [rad/s],
+    contacts of relaxed tyres.
+    """
 
     x: Scalar
     y: Scalar
@@ -66,6 +78,7 @@ class CarState(NamedTuple):
     yaw_velocity: Scalar
     steer: Scalar
     spins: Wheels
+    contacts: tuple[PyTree, ...] = ((), (), (), ())
 
 
 class CarSignals(NamedTuple):
@@ -147,6 +160,10 @@ class Contacts(NamedTuple):
     slip_angles: Wheels
     rims: Wheels
     places: Wheels
+
+    def each(self) -> list[Contact]:
+        """Return slip and slip angle of each wheel."""
+        return [Contact(slip, angle) for slip, angle in zip(self.slips, self.slip_angles, strict=True)]
 
 
 class CarForces(NamedTuple):
@@ -230,7 +247,8 @@ class Car(SlipProbes):
     def start(self, initial: BrakeStart) -> CarState:
         """Return the state of straight motion for a speed and a slip of all wheels."""
         spin, zero = (1 - initial.slip) * initial.speed / self.radius, 0.0 * initial.speed
-        return CarState(zero, zero, zero, initial.speed, zero, zero, zero, Wheels(spin, spin, spin, spin))
+        contacts = tuple(settled_contact(tyre, initial.slip) for tyre in self._tyres())
+        return CarState(zero, zero, zero, initial.speed, zero, zero, zero, Wheels(spin, spin, spin, spin), contacts)
 
     def derivative(self, t: Scalar, state: CarState, control: CarControls) -> CarState:
         """Return dx/dt under brake torques [N m] and demanded steer angle [rad]."""
@@ -257,11 +275,13 @@ class Car(SlipProbes):
             road.moment / self.yaw_inertia,
             (steer - state.steer) / self.steer_lag,
             Wheels(*spins),
+            self._contact_rates(contacts, state),
         )
 
     def least_scales(self) -> CarState:
         """Return the sizes below which errors are absolute: in straight motion y, yaw and steer angle are rounding."""
-        return CarState(1.0, 1.0, 0.1, 1.0, 0.1, 0.1, 0.1, Wheels(1.0, 1.0, 1.0, 1.0))
+        contacts = tuple(map(least_contact, self._tyres()))
+        return CarState(1.0, 1.0, 0.1, 1.0, 0.1, 0.1, 0.1, Wheels(1.0, 1.0, 1.0, 1.0), contacts)
 
     def project(self, state: CarState) -> CarState:
         """Return the state with neither car nor wheels moving backwards."""
@@ -295,7 +315,8 @@ class Car(SlipProbes):
         """Return the torques R F + (1 - slip) J u'/R [N m] at which all wheels hold their slips in straight motion."""
         slips = Wheels(*(getattr(target, name) for name in BRAKES.values()))
         straight = self.start(BrakeStart(speed=output.speed, slip=0.0))._replace(x=output.distance)
-        forces_of_loads = self._forces_of_loads(self._contacts(straight)._replace(slips=slips), straight)
+        still = straight._replace(contacts=tuple(map(settled_contact, self._tyres(), slips)))
+        forces_of_loads = self._forces_of_loads(self._contacts(still)._replace(slips=slips), still)
         road = self._sum_forces(forces_of_loads, self._solve_loads(forces_of_loads, straight), straight)
         deceleration = -self._accelerations(straight, road)[0]
         torques = [
@@ -396,12 +417,17 @@ class Car(SlipProbes):
     def _forces_of_loads(self, contacts: Contacts, state: CarState) -> list[ForceOfLoad]:
         """Return the force of each wheel as a function of its load; proportional tyres are evaluated here, once."""
         speed = self._total_velocity(state)
+        slips = (contact or motion for contact, motion in zip(state.contacts, contacts.each(), strict=True))
         return [
-            _force_of_load(tyre, slip, slip_angle, speed, place)
-            for tyre, slip, slip_angle, place in zip(
-                self._tyres(), contacts.slips, contacts.slip_angles, contacts.places, strict=True
-            )
+            _force_of_load(tyre, *slip_and_angle, speed, place)
+            for tyre, slip_and_angle, place in zip(self._tyres(), slips, contacts.places, strict=True)
         ]
+
+    def _contact_rates(self, contacts: Contacts, state: CarState) -> tuple[PyTree, ...]:
+        """Return d(contact)/dt of the relaxed tyres."""
+        speed = self._total_velocity(state)
+        wheels = zip(self._tyres(), state.contacts, contacts.each(), strict=True)
+        return tuple(contact_rate(tyre, contact, motion, speed) for tyre, contact, motion in wheels)
 
     def _sum_forces(self, forces_of_loads: list[ForceOfLoad], loads: Wheels, state: CarState) -> CarForces:
         """Return the forces of the road under the loads."""

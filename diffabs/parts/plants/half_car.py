@@ -25,12 +25,22 @@ import jax.numpy as jnp
 
 from diffabs.core.channels import put_first
 from diffabs.core.numerics import quotient
-from diffabs.core.protocols import BrakeOutput, Objective, Tyre
+from diffabs.core.protocols import BrakeOutput, Contact, Objective, Tyre
 from diffabs.core.pytree import param, part, pytree, static
 from diffabs.core.types import Any, PyTree, Scalar
 from diffabs.parts.controllers import PID, Clamping, NoFeedforward, PerChannel
 from diffabs.parts.objectives import BRAKING, InChannel, StopDistance, StopTime
-from diffabs.parts.plants.wheel import GRAVITY, BrakeStart, SlipProbes, forward_speed, halt_at_zero, slip_ratio
+from diffabs.parts.plants.wheel import (
+    GRAVITY,
+    BrakeStart,
+    SlipProbes,
+    contact_rate,
+    forward_speed,
+    halt_at_zero,
+    least_contact,
+    settled_contact,
+    slip_ratio,
+)
 from diffabs.parts.references import FilteredSlip, PerTarget
 from diffabs.parts.roads import RoadTyre
 from diffabs.parts.stops import Standstill
@@ -40,12 +50,13 @@ CHANNELS = {"front_brake": "front_slip", "rear_brake": "rear_slip"}
 
 
 class HalfCarState(NamedTuple):
-    """Speed [m/s], angular speeds of the axles [rad/s], distance of the front axle [m]."""
+    """Speed [m/s], angular speeds of the axles [rad/s], distance of the front axle [m], contacts of relaxed tyres."""
 
     speed: Scalar
     front_spin: Scalar
     rear_spin: Scalar
     distance: Scalar
+    contacts: tuple[PyTree, ...] = ((), ())
 
 
 class HalfCarSignals(NamedTuple):
@@ -167,7 +178,8 @@ class HalfCar(SlipProbes):
     def start(self, initial: BrakeStart) -> HalfCarState:
         """Return the state for a speed and a slip of both axles."""
         spin = (1 - initial.slip) * initial.speed / self.radius
-        return HalfCarState(initial.speed, spin, spin, 0.0 * initial.speed)
+        contacts = tuple(settled_contact(tyre, initial.slip) for tyre in self._tyres())
+        return HalfCarState(initial.speed, spin, spin, 0.0 * initial.speed, contacts)
 
     def derivative(self, t: Scalar, state: HalfCarState, control: AxleBrakes) -> HalfCarState:
         """Return dx/dt under the brake torques [N m]."""
@@ -181,12 +193,20 @@ class HalfCar(SlipProbes):
             halt_at_zero(state.front_spin, quotient(self.radius * front - control.front_brake, self.front_inertia)),
             halt_at_zero(state.rear_spin, quotient(self.radius * rear - control.rear_brake, self.rear_inertia)),
             state.speed,
+            tuple(
+                contact_rate(tyre, contact, Contact(slip, 0.0 * slip), state.speed)
+                for tyre, contact, slip in zip(self._tyres(), state.contacts, self._slips(state), strict=True)
+            ),
         )
+
+    def least_scales(self) -> HalfCarState:
+        """Return the sizes below which errors are absolute: those of contacts, which begin at 0."""
+        return HalfCarState(0.0, 0.0, 0.0, 0.0, tuple(map(least_contact, self._tyres())))
 
     def project(self, state: HalfCarState) -> HalfCarState:
         """Return the state with neither car nor axles moving backwards."""
         front, rear = forward_speed(state.front_spin), forward_speed(state.rear_spin)
-        return HalfCarState(forward_speed(state.speed), front, rear, state.distance)
+        return state._replace(speed=forward_speed(state.speed), front_spin=front, rear_spin=rear)
 
     def output(self, state: HalfCarState) -> HalfCarOutput:
         """Return slips [1], speeds [m/s], deceleration [m/s^2], loads [N] and distance [m]."""
@@ -257,6 +277,14 @@ class HalfCar(SlipProbes):
         rims = (self.radius * state.front_spin, self.radius * state.rear_spin)
         return Axles(*(slip_ratio(state.speed, rim, self.crawl_speed) for rim in rims))
 
+    def _tyres(self) -> tuple[Tyre, ...]:
+        return self.front_tyre, self.rear_tyre
+
+    def _contact_slips(self, state: HalfCarState) -> Axles:
+        """Return the slips to which the forces belong: those of the axles, or of the contacts of relaxed tyres."""
+        pairs = zip(state.contacts, self._slips(state), strict=True)
+        return Axles(*(contact.slip if contact else slip for contact, slip in pairs))
+
     def _places(self, distance: Scalar) -> Axles:
         """Return the distances of both axles along the road."""
         return Axles(distance, distance - self.to_front - self.to_rear)
@@ -269,7 +297,7 @@ class HalfCar(SlipProbes):
         )
 
     def _tyre_forces(self, state: HalfCarState, loads: Axles) -> Axles:
-        return self._forces(self._slips(state), self._places(state.distance), state.speed, loads)
+        return self._forces(self._contact_slips(state), self._places(state.distance), state.speed, loads)
 
     def _rolling_force(self, speed: Scalar) -> Scalar:
         """Return f m g cos(incline) while the car moves."""
@@ -278,7 +306,7 @@ class HalfCar(SlipProbes):
 
     def _braking_force(self, state: HalfCarState) -> Scalar:
         """Return the road's whole force X in a state."""
-        return self._solve_force(self._slips(state), self._places(state.distance), state.speed)
+        return self._solve_force(self._contact_slips(state), self._places(state.distance), state.speed)
 
     def _solve_force(self, slips: Axles, places: Axles, speed: Scalar) -> Scalar:
         """Return the X at which tyres and rolling resistance have the sum X under the loads of X."""

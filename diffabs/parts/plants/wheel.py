@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.numerics import larger, quotient, smaller
-from diffabs.core.protocols import BrakeOutput, Road
+from diffabs.core.protocols import BrakeOutput, Contact, Road, Tyre
 from diffabs.core.pytree import param, pytree
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.parts.controllers import PID
@@ -22,6 +22,8 @@ FROZEN_OUTPUTS = ("speed", "distance")  # outputs that a linear model of the sli
 GRAVITY = 9.81  # m/s^2, the value in all numbers of the papers
 # A step that ends on standstill leaves a speed of its own rounding. Some plants treat a wheel that turns differently.
 STANDSTILL_SPEED = 1e-9  # m/s or rad/s
+
+LEAST_CONTACT = 0.01  # 1 or rad: slips and slip angles of contacts below it have absolute errors
 
 
 @pytree
@@ -53,6 +55,21 @@ def halt_at_zero(speed: Scalar, rate: Scalar) -> Scalar:
 def forward_speed(speed: Scalar) -> Scalar:
     """Return the speed, or 0 where a step ended at standstill or beyond it."""
     return jnp.where(jnp.greater(speed, STANDSTILL_SPEED), speed, 0.0)
+
+
+def settled_contact(tyre: Tyre, slip: Scalar) -> PyTree:
+    """Return the contact of a tyre at rest at a slip [1]; () for a tyre whose force follows the slip at once."""
+    return Contact(slip, 0.0 * slip) if hasattr(tyre, "relax") else ()
+
+
+def least_contact(tyre: Tyre) -> PyTree:
+    """Return slip and slip angle of a contact below which errors are absolute: both begin at 0."""
+    return Contact(LEAST_CONTACT, LEAST_CONTACT) if hasattr(tyre, "relax") else ()
+
+
+def contact_rate(tyre: Tyre, contact: PyTree, motion: Contact, speed: Scalar) -> PyTree:
+    """Return d(contact)/dt for slip and slip angle of the wheel and the vehicle's speed [m/s]."""
+    return tyre.relax(contact, *motion, speed) if contact else ()
 
 
 class SlipProbes:

@@ -21,4 +21,5 @@ from diffabs.parts.roads.rational import RationalCurve as RationalCurve
 from diffabs.parts.roads.tabulated import SPLINE_B as SPLINE_B
 from diffabs.parts.roads.tabulated import Tabulated as Tabulated
 from diffabs.parts.roads.tyres import PacejkaTyre as PacejkaTyre
+from diffabs.parts.roads.tyres import RelaxedTyre as RelaxedTyre
 from diffabs.parts.roads.tyres import RoadTyre as RoadTyre

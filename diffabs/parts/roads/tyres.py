@@ -11,18 +11,25 @@ In combined slip the force of a `RoadTyre` is that of the resultant slip, agains
 
 A `PacejkaTyre` has the weighting functions of the Magic Formula without camber.
 
+A tyre's tread bends before it slides. A `RelaxedTyre` therefore follows slip and slip angle over a rolled distance:
+
+    sigma slip_c' = v (slip - slip_c),   sigma_y A_c' = v (A - A_c),   F = F(slip_c, A_c)
+
+After a step of the slip, 63.2 % of it is reached sigma metres further, at any speed.
+
 Sources: U. Kiencke and L. Nielsen, Automotive Control Systems, 2nd ed., sec. 8.3, for the resultant slip; H. B.
-Pacejka, Tire and Vehicle Dynamics, 3rd ed., sec. 4.3; M. Althoff and G. Wuersching, CommonRoad: Vehicle Models, 2020,
-Table 7, for the coefficients. That model has the vertical shift Fz Vx inside the sine, where Pacejka's
-formula adds it outside; here it is inside, too.
+Pacejka, Tire and Vehicle Dynamics, 3rd ed., sec. 4.3, and 7.2 for the relaxation; M. Althoff and G. Wuersching,
+CommonRoad: Vehicle Models, 2020, Table 7, for the coefficients. That model has the vertical shift Fz Vx inside the
+sine, where Pacejka's formula adds it outside; here it is inside, too.
 """
 
+from collections.abc import Iterator
 from typing import ClassVar
 
 import jax.numpy as jnp
 
-from diffabs.core.numerics import larger
-from diffabs.core.protocols import Road, TyreForces
+from diffabs.core.numerics import larger, quotient
+from diffabs.core.protocols import Contact, Road, Tyre, TyreForces
 from diffabs.core.pytree import param, part, pytree
 from diffabs.core.types import Scalar
 from diffabs.parts.roads.burckhardt import DRY_ASPHALT
@@ -144,6 +151,55 @@ class PacejkaTyre:
             self.braking_force(slip, load, speed, distance)
             * _weight(along, slip_angle, self.r_hx1, self.r_cx1, self.r_ex1),
             lateral * _weight(across, slip, self.r_hy1, self.r_cy1, self.r_ey1) + by_slip,
+        )
+
+
+@pytree
+class RelaxedTyre:
+    """A tyre whose force follows slip and slip angle over a distance: the relaxation length.
+
+    The defaults are of the size of a passenger car's tyre, of no particular one. The slip that a plant shows is that of
+    the wheel; the force belongs to the slip of the contact, a state of the plant.
+
+    >>> from diffabs.parts.plants import BrakeStart, HalfCar
+    >>> from diffabs.parts.roads import RelaxedTyre
+    >>> car = HalfCar(front_tyre=RelaxedTyre(length=0.3), rear_tyre=RelaxedTyre(length=0.3))
+    >>> state = car.start(BrakeStart(speed=20.0))
+    >>> locked = state._replace(front_spin=0.0)
+    >>> print(car.output(locked).front_slip, car.output(locked).deceleration)
+    1.0 0.0
+    """
+
+    tyre: Tyre = part(default=RoadTyre)
+    """Tyre that has the force at a constant slip."""
+    length: Scalar = param(default=0.3, unit="m", above=0.0)
+    """Relaxation length sigma of the slip."""
+    lateral_length: Scalar = param(default=0.5, unit="m", above=0.0)
+    """Relaxation length of the slip angle."""
+
+    def problems(self) -> Iterator[str]:
+        """Yield a line for a relaxed tyre inside: the contact has one relaxation length."""
+        if hasattr(self.tyre, "relax"):
+            yield "tyre has a relaxation length of its own; enclose the tyre inside it"
+
+    @property
+    def proportional(self) -> bool:
+        """Whether the friction of the enclosed tyre does not depend on the load."""
+        return self.tyre.proportional
+
+    def braking_force(self, slip: Scalar, load: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
+        """Return the force [N] at the slip of the contact."""
+        return self.tyre.braking_force(slip, load, speed, distance)
+
+    def forces(self, slip: Scalar, slip_angle: Scalar, load: Scalar, speed: Scalar, distance: Scalar) -> TyreForces:
+        """Return both forces [N] at slip and slip angle of the contact."""
+        return self.tyre.forces(slip, slip_angle, load, speed, distance)
+
+    def relax(self, contact: Contact, slip: Scalar, slip_angle: Scalar, speed: Scalar) -> Contact:
+        """Return d(contact)/dt of a wheel with slip [1] and slip angle [rad] at a vehicle speed [m/s]."""
+        return Contact(
+            speed * quotient(slip - contact.slip, self.length),
+            speed * quotient(slip_angle - contact.slip_angle, self.lateral_length),
         )
 
 
