@@ -495,5 +495,5 @@ def test_every_part_is_differentiated_in_some_loop():
         for name, part in vars(family).items()
         if dataclasses.is_dataclass(part) and isinstance(part, type)
     }
-    # Runs of cars take a minute to compile; tests/plants/test_half_car.py and test_car.py differentiate them.
-    assert offered - used == {"Car", "HalfCar", "HoldCourse", "PacejkaTyre", "RoadTyre"}
+    # Runs of cars take a minute to compile; test_half_car.py, test_car.py and test_relaxation.py differentiate them.
+    assert offered - used == {"Car", "HalfCar", "HoldCourse", "PacejkaTyre", "RelaxedTyre", "RoadTyre"}
