@@ -138,9 +138,10 @@ class RiseTime(HeldValue):
 
 
 def _time_above(segment: Segment, read: Callable[[PyTree], Scalar], threshold: Scalar) -> Scalar:
-    """Return the part of a step with `read`(output) above a threshold [s]."""
+    """Return the part of a step with `read`(output) at or above a threshold [s]."""
     excess = segment.output(read).minus(threshold)
-    above, below, root = excess.start > 0, excess.end <= 0, excess.root()
+    # A crossing at the end of a step belongs to the next one, which begins at a root: there it has a derivative.
+    above, below, root = excess.start >= 0, excess.end < 0, excess.root()
     return segment.h * jnp.where(above, jnp.where(below, root, 1.0), jnp.where(below, 0.0, 1.0 - root))
 
 
