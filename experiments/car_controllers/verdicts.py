@@ -5,6 +5,7 @@ Each assessment is a JSON file as `diffabs assess --json` writes it; `diffabs re
     python experiments/car_controllers/verdicts.py
 """
 
+import math
 import pathlib
 from collections.abc import Sequence
 
@@ -44,18 +45,32 @@ def judge_controllers(names: Sequence[str] = (), folder: pathlib.Path = FOLDER) 
     return assessments
 
 
-def format_rows(assessments: dict[str, Assessment]) -> list[str]:
-    """Return the rows of the table: the figure of the worst stop for each clause, in bold if it does not meet it."""
+def format_table(assessments: dict[str, Assessment]) -> list[list[str]]:
+    """Return the cells of a table: for each clause its limit and, by controller, the figure of the worst stop.
+
+    A figure that does not meet its limit is in bold.
+    """
+    clauses = zip(*(assessment.clauses for assessment in assessments.values()), strict=True)
     return [
-        f"| {name} | {' | '.join(map(_format_cell, assessment.clauses))} |" for name, assessment in assessments.items()
+        ["clause", "limit", *assessments],
+        *([_format_name(row[0]), _format_limit(row[0]), *map(_format_cell, row)] for row in clauses),
     ]
 
 
+def _format_name(clause: Clause) -> str:
+    return f"{clause.number} {clause.rule}".strip()
+
+
+def _format_limit(clause: Clause) -> str:
+    return f"{'>=' if clause.at_least else '<='} {clause.limit:.3g} {clause.unit.replace('1', '')}".rstrip()
+
+
 def _format_cell(clause: Clause) -> str:
-    figure = f"{clause.figure:.2f} {clause.unit.replace('1', '')}".rstrip()
+    unit = clause.unit.replace("1", "")
+    figure = "never" if math.isinf(clause.figure) else f"{clause.figure:.2f} {unit}".rstrip()
     return {"met": figure, "not met": f"**{figure}**", "undecided": "undecided"}[clause.verdict]
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    print(*format_rows(judge_controllers()), sep="\n")
+    print(*(f"| {' | '.join(cells)} |" for cells in format_table(judge_controllers())), sep="\n")

@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from project import ROOT
+from reports import Page
 
 from diffabs.assess import RuleStop, StopProgram
 from diffabs.parts.plants import GRAVITY
@@ -48,3 +49,22 @@ def test_three_cars_give_the_ranks_of_the_table(study):
         assert row["lost runs"] == 0
         for column in ("good, 120 km/h [% over least]", "slippery, 55 km/h [% over least]"):
             assert row[column] == pytest.approx(stored[row["controller"]][column], rel=0.1)
+
+
+@pytest.mark.slow
+def test_the_page_of_verdicts_has_the_figures_of_the_table(tmp_path):
+    """The command of the page, for one controller that meets all clauses and one that does not."""
+    verdicts = importlib.import_module("experiments.car_controllers.verdicts")
+    names = ("constant torque", "PID of each wheel")
+    assessments = verdicts.judge_controllers(names, tmp_path)
+    assert [assessment.passed for assessment in assessments.values()] == [0, 1]
+    lines = (STORED.parent / "README.md").read_text(encoding="utf-8").splitlines()
+    page = [[cell.strip() for cell in line[1:-1].split("|")] for line in lines]
+    start = next(i for i, cells in enumerate(page) if cells[0] == "clause")
+    columns = [page[start].index(heading) for heading in ("clause", "limit", *names)]
+    rows = [page[start], *page[start + 2 : start + 12]]
+    assert verdicts.format_table(assessments) == [[cells[column] for column in columns] for cells in rows]
+    text = Page((tmp_path / verdicts.PAGE).read_text()).text
+    assert "1 of 2 meet all: PID of each wheel." in text
+    worst = assessments["constant torque"].clauses[0]
+    assert f"constant torque {worst.figure:.6g} at least 0.75 not met {worst.stop}" in text
