@@ -14,7 +14,7 @@ from seams import replace_seam
 from test_explore import SHORT
 
 from diffabs.output.explore import curves, stability, tuning
-from diffabs.output.explore.panels import Curves, Fan
+from diffabs.output.explore.panels import Curve, Curves, Fan, Panel, Path
 from diffabs.output.explore.session import AS_GIVEN, CERTIFIED, ProofVerdict, Session, Tools
 from diffabs.tune.result import DescentPoint, TuningProgress
 
@@ -626,6 +626,41 @@ def test_a_drag_redraws_the_curves_without_the_margins(visit, monkeypatch):
         assert not page._loop_curves(page.session.scenario(), page.version)
         await asyncio.sleep(0)
         assert not page.results.frequency.element.visible
+
+    visit(user)
+
+
+@killed_by("output.explore.page", "        self.path_place.clear()\n", "")
+@killed_by(
+    "output.explore.page", "self.path_map.change(path_chart.change_path_before(run.path if run else None))", "pass"
+)
+@killed_by("output.explore.page", 'self._say("", version)', "pass")
+@killed_by("output.explore.page", "                self._say(name, version)\n", "")
+def test_a_run_with_a_path_is_seen_from_above(visit, monkeypatch):
+    async def user(opened):
+        page, sent, said = opened.page, [], []
+        run = Curves(np.arange(2.0), (Panel("1", (Curve("slip", np.zeros(2)),)),), {}, "", draft=False)
+        line = np.array([0.0, 5.0])
+        path = Path(line, line, line, line, np.empty((0, 0, 2)), ((-1.0, 6.0), (-1.0, 1.0)), ())
+        monkeypatch.setattr(curves, "run_curves", lambda *given: run._replace(path=path))
+        monkeypatch.setattr(curves, "run_fan", lambda *given: said.append(page.waiting_line.text))
+        monkeypatch.setattr(stability, "linear_stability", broken)
+        monkeypatch.setattr(page, "later", lambda show, *given: show(*given))
+        page.results.cells = dict.fromkeys(page.session.original.objectives)
+        assert "compiling" in opened.find("preparing").text
+        with opened.client:
+            page.drawer.run()
+            assert opened.elements("preparing") == []
+            assert opened.find("path").options["dataset"][0]["source"]["x"] == [0.0, 5.0]
+            monkeypatch.setattr(page.path_map, "change", sent.append)
+            page.pin(page.shown)
+            page.pin(None)
+            assert [change["dataset"][0]["source"]["x"] for change in sent] == [[0.0, 5.0], []]
+            page.thinker.run()
+            assert said == ["computing the fan of 200 runs (compiles at first) …"]
+            assert page.waiting_line.text == ""
+            page.begin()
+        assert opened.elements("path") == []
 
     visit(user)
 

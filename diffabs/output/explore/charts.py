@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from diffabs.core.types import JsonObject
-from diffabs.output.explore.panels import Curves, Fan, Panel
+from diffabs.output.explore.panels import DISPLAY_ROUNDING, Curves, Fan, Panel
 from diffabs.output.explore.stability import Stability
 
 BLUE, RED, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#767676", "#1F2933"
@@ -169,7 +169,7 @@ def round_for_screen(values: object) -> list[float | None]:
 
 
 def _legend(panel: Panel, i: int, top: float) -> JsonObject:
-    names = [line.name for line in panel.lines] + ([BEFORE, OUTER, INNER] if i == 0 else [])
+    names = [*dict.fromkeys(line.name for line in panel.lines)] + ([BEFORE, OUTER, INNER] if i == 0 else [])
     style = {"fontSize": 11, "color": INK}
     place = {"right": 18, "top": f"{top - 5.2:.2f}%", "itemWidth": 18, "itemHeight": 8, "itemGap": 12, "icon": DASH}
     return {"data": names, "textStyle": style, **place}
@@ -209,14 +209,15 @@ def _y(panel: Panel, i: int) -> JsonObject:
 def axis_label(panel: Panel) -> str:
     """Return the label of a panel's vertical axis: quantity and unit."""
     signals = [line.name for line in panel.lines if line.name not in AIMS]
-    words = signals[0] if len(signals) == 1 and signals[0] != "control" else QUANTITIES.get(panel.unit, "")
+    single = signals[0] if len(signals) == 1 and signals[0] != "control" else ""
+    words = panel.quantity or single or QUANTITIES.get(panel.unit, "")
     return f"{words or ', '.join(signals[:2])} [{panel.unit}]"
 
 
 def _series(panel: Panel, i: int) -> list[JsonObject]:
-    place = {"type": "line", "xAxisIndex": i, "yAxisIndex": i, "showSymbol": False, "symbol": "none"}
+    chart = {"type": "line", "xAxisIndex": i, "yAxisIndex": i, "showSymbol": False, "symbol": "none"}
     # The lowest band of the stack is transparent; it lifts the others to the 5 % quantile.
-    hidden = {**place, "datasetId": "fan", "stack": f"fan {i}", "stackStrategy": "all", "silent": True}
+    hidden = {**chart, "datasetId": "fan", "stack": f"fan {i}", "stackStrategy": "all", "silent": True}
     hidden |= {"lineStyle": {"width": 0}, "tooltip": {"show": False}, "z": 1}
     names = ("", OUTER, INNER, OUTER)
     shades = (0.0, 0.13, 0.26, 0.13)
@@ -226,21 +227,20 @@ def _series(panel: Panel, i: int) -> list[JsonObject]:
         for j, (name, shade) in enumerate(zip(names, shades, strict=True))
     ]
     before = {"lineStyle": {"color": GREY, "width": 1.5, "type": [6, 3]}, "itemStyle": {"color": GREY}, "z": 2}
-    series.append({**place, "name": BEFORE, "datasetId": "before", "encode": {"x": "t", "y": f"{i}.0"}, **before})
-    signals = 0
+    series.append({**chart, "name": BEFORE, "datasetId": "before", "encode": {"x": "t", "y": f"{i}.0"}, **before})
+    signals = sum(line.name not in AIMS for line in panel.lines)
+    followed = sum(line.name == panel.lines[-1].name for line in panel.lines)
     for j, line in enumerate(panel.lines):
-        dashes = AIMS.get(line.name, "solid")
-        colour = (
-            INK
-            if line.name == "setpoint"
-            else RED
-            if line.name in AIMS
-            else CURVE_COLOURS[signals % len(CURVE_COLOURS)]
-        )
-        signals += line.name not in AIMS
-        style = {"color": colour, "width": 2 if j == 0 else 1.4, "type": dashes}
-        look = {"lineStyle": style, "itemStyle": {"color": colour}, "z": 4 if j == 0 else 3}
-        series.append({**place, "name": line.name, "datasetId": "now", "encode": {"x": "t", "y": f"{i}.{j}"}, **look})
+        aim = line.name in AIMS
+        # Aims of several signals have the colours of their signals, in the same order.
+        place = (j - signals) % followed if aim else j
+        colour = CURVE_COLOURS[place % len(CURVE_COLOURS)]
+        if aim and followed == 1:
+            colour = INK if line.name == "setpoint" else RED
+        width = 2.0 if j == 0 else 1.4 if followed == 1 or not aim else 1.0
+        look = {"lineStyle": {"color": colour, "width": width, "type": AIMS.get(line.name, "solid")}}
+        look |= {"itemStyle": {"color": colour}, "z": 4 if j == 0 else 3}
+        series.append({**chart, "name": line.name, "datasetId": "now", "encode": {"x": "t", "y": f"{i}.{j}"}, **look})
     return series
 
 
@@ -251,9 +251,10 @@ def _limits(panel: Panel) -> JsonObject:
     """
     if panel.lines[-1].name != "command":
         return {}
-    values = panel.lines[0].values[np.isfinite(panel.lines[0].values)]
+    values = np.concatenate([line.values for line in panel.lines if line.name != "command"])
+    values = values[np.isfinite(values)]
     greatest = float(np.max(np.abs(values))) if values.size else 0.0
-    if not greatest:
+    if greatest < DISPLAY_ROUNDING:
         return {"min": -1, "max": 1}
     nice = _round_up_nicely(LIMIT_ROOM * greatest)
     low, high = -nice if values.min() < 0 else 0, nice if values.max() > 0 else 0

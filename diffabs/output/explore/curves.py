@@ -8,7 +8,7 @@ import numpy as np
 
 from diffabs.core.channels import select_channel
 from diffabs.core.pytree import get, parameters
-from diffabs.core.types import Part, Scalar
+from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.core.units import control_units
 from diffabs.engine.solvers import Adaptive, FixedStep, Solver
 from diffabs.linear.robustness import low_discrepancy_points
@@ -22,6 +22,7 @@ from diffabs.loop.run import rollout
 from diffabs.output.explore.friction import FACTOR_PATH
 from diffabs.output.explore.knobs import is_vehicle, mass_path
 from diffabs.output.explore.panels import Curve, Curves, Fan, Panel, Spread
+from diffabs.output.explore.path import trace_path
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
 
@@ -74,11 +75,12 @@ def run_curves(scenario: Scenario, by: Solver | None = None) -> Curves:
     shown = thin(count, INSTANTS)
     t = np.asarray(run.trajectory.sample.t)[shown]
     panels = tuple(
-        Panel(panel.unit, tuple(Curve(line.name, line.values[shown]) for line in panel.lines))
+        panel._replace(lines=tuple(Curve(line.name, line.values[shown]) for line in panel.lines))
         for panel in _layout(run, scenario.loop.plant)
     )
     metrics = {name: float(run.metrics[name]) for name in scenario.objectives}
-    return Curves(t, panels, metrics, _describe_end(scenario, run, t), by is not None)
+    path = trace_path(t, jax.tree.map(lambda values: values[shown], run.trajectory.sample.output), scenario.loop.plant)
+    return Curves(t, panels, metrics, _describe_end(scenario, run, t), by is not None, path)
 
 
 def transient_end(curves: Curves) -> float:
@@ -88,9 +90,8 @@ def transient_end(curves: Curves) -> float:
     the largest distance from the target. Without a target the last value takes its place. A run that does not settle is
     shown whole.
     """
-    lines = {line.name: line.values for line in curves.panels[0].lines}
     signal = curves.panels[0].lines[0].values
-    target = lines["target"]
+    target = next(line.values for line in curves.panels[0].lines if line.name == "target")
     away = np.abs(signal - np.where(np.isfinite(target), target, signal[-1]))
     far = np.flatnonzero(away > SETTLED_SHARE * np.max(away, initial=0.0))
     end = float(curves.t[-1])
@@ -160,28 +161,43 @@ def _quantiles(values: np.ndarray) -> np.ndarray:
 def _layout(run: Run, plant: Part) -> list[Panel]:
     """Return the panels of one run or a batch, in full length.
 
-    They are each group of signals with target and setpoint, the first group without, and each control with its command.
-    Signals of one unit are a group; in a loop with several targets each of theirs is a group of its own.
+    They are each group of signals with target and setpoint, the first group without, and each group of controls with
+    their commands. Signals without target are a group if they have one unit. Signals with targets, and controls, also
+    need the same last word, such as the slips of four wheels.
     """
     assert run.trajectory is not None
     sample = run.trajectory.sample
     channels = getattr(sample.target, "_fields", ())
     groups: dict[tuple[str, str], list[str]] = {}
     for name, unit in type(sample.output).units.items():
-        groups.setdefault((unit, name if name in channels else ""), []).append(name)
+        groups.setdefault((unit, _last_word(name) if name in channels else ""), []).append(name)
     aimed, others = [], []
-    for (unit, _), names in groups.items():
+    for (unit, quantity), names in groups.items():
         followed = [name for name in channels or sample.output._fields[:1] if name in names]
-        lines = [_curve(name, getattr(sample.output, name)) for name in names]
-        for name in followed:
-            lines += [_curve(aim, select_channel(getattr(sample, aim), name)) for aim in ("target", "setpoint")]
-        (aimed if followed else others).append(Panel(unit, tuple(lines)))
+        lines = _family(names, quantity, sample.output)
+        for aim in ("target", "setpoint") if followed else ():
+            lines += [_curve(aim, select_channel(getattr(sample, aim), name)) for name in followed]
+        (aimed if followed else others).append(Panel(unit, tuple(lines), quantity if len(names) > 1 else ""))
     shown = [*aimed, *others[:1]]
     shown = [_in_kmh(panel) for panel in shown] if is_vehicle(plant) else shown
+    controls: dict[tuple[str, str], list[str]] = {}
     for name, unit in control_units(plant).items():
-        control, command = (select_channel(signal, name) for signal in (sample.control, sample.command))
-        shown.append(Panel(unit, (_curve(name, control), _curve("command", command))))
+        controls.setdefault((unit, _last_word(name)), []).append(name)
+    for (unit, quantity), names in controls.items():
+        lines = _family(names, quantity, sample.control)
+        lines += [_curve("command", select_channel(sample.command, name)) for name in names]
+        shown.append(Panel(unit, tuple(lines), quantity if len(names) > 1 else ""))
     return shown
+
+
+def _last_word(name: str) -> str:
+    return name.rpartition("_")[2]
+
+
+def _family(names: list[str], quantity: str, signals: PyTree) -> list[Curve]:
+    """Return the curves of some signals; several of one quantity go without its name."""
+    tail = f"_{quantity}" if quantity and len(names) > 1 else ""
+    return [_curve(name.removesuffix(tail), select_channel(signals, name)) for name in names]
 
 
 def _curve(name: str, values: Scalar) -> Curve:
@@ -191,7 +207,7 @@ def _curve(name: str, values: Scalar) -> Curve:
 def _in_kmh(panel: Panel) -> Panel:
     if panel.unit != "m/s":
         return panel
-    return Panel("km/h", tuple(Curve(line.name, KMH * line.values) for line in panel.lines))
+    return panel._replace(unit="km/h", lines=tuple(Curve(line.name, KMH * line.values) for line in panel.lines))
 
 
 def _describe_end(scenario: Scenario, run: Run, t: np.ndarray) -> str:

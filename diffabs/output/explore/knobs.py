@@ -152,7 +152,7 @@ def knobs(scenario: Scenario) -> dict[str, Knob]:
 
 def is_vehicle(plant: Part) -> bool:
     """Return whether a plant shows the speed of a wheel; such a plant's speeds are displayed in km/h."""
-    return "wheel_speed" in plant.shows.units
+    return any(name.endswith("wheel_speed") for name in plant.shows.units)
 
 
 def unit_words(unit: str) -> str:

@@ -1,5 +1,7 @@
 """Style sheet of the page, and the script that runs in the browser."""
 
+from diffabs.output.explore.path_chart import ELEMENT_RATIO
+
 STYLE = """
 body { background: #F3F5F7; color: #1F2933; font-family: 'Inter', 'Roboto', system-ui, sans-serif; font-size: 13px; }
 .nicegui-content { padding: 0; gap: 0; }
@@ -24,7 +26,9 @@ body { background: #F3F5F7; color: #1F2933; font-family: 'Inter', 'Roboto', syst
   white-space: nowrap; }
 .curves { flex: 1; min-height: 0; }
 .fill { width: 100%; height: 100%; }
-.foot { color: #52606D; font-size: 12px; padding: 0 12px 2px; }
+.path.nicegui-echart { width: 100%; height: auto; aspect-ratio: RATIO; flex: none; }
+.preparing { margin: 30vh auto 0; max-width: 420px; text-align: center; color: #52606D; line-height: 1.5; }
+.foot { display: flex; gap: 12px; color: #52606D; font-size: 12px; padding: 0 12px 2px; }
 .group { font-size: 11px; font-weight: 600; color: #7B8794; letter-spacing: .04em; text-transform: uppercase;
   margin-top: 6px; }
 .knob { display: grid; grid-template-columns: minmax(0, 1fr) 84px 62px; column-gap: 6px; align-items: center; }
@@ -65,7 +69,7 @@ body { background: #F3F5F7; color: #1F2933; font-family: 'Inter', 'Roboto', syst
 .q-expansion-item .q-item__section--avatar { display: none; }
 .chooser .q-field__native { font-size: 13px; }
 .nicegui-echart { padding: 0; }
-"""
+""".replace("RATIO", f"{ELEMENT_RATIO:.4f}")
 
 # Measures the latency of the page: from an edit in the browser until a curve of this edit, or a later one, is painted.
 # A message posted in requestAnimationFrame arrives after the paint of that frame.

@@ -13,7 +13,7 @@ import numpy as np
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.host.values import ScenarioError
-from diffabs.output.explore import charts, curves, stability
+from diffabs.output.explore import charts, curves, path_chart, stability
 from diffabs.output.explore.canvas import Canvas, encode_change
 from diffabs.output.explore.controls import Controls
 from diffabs.output.explore.header import add_header
@@ -30,6 +30,17 @@ from diffabs.scenario.scenario import Scenario
 QUICK_JOB_S = 0.05  # s; quicker computations are repeated during a drag
 REST = 0.15  # s without a change before all results are computed
 PROVING = 0.35  # s without a change before a proof is attempted
+PREPARING = (
+    "compiling and running this loop … A brake takes a few seconds, a car with four wheels up to a minute; after that, "
+    "a dragged number compiles nothing."
+)
+STEP_WORDS = {
+    "poles": "poles and margins",
+    "loop curves": "curves over frequency",
+    "fan": f"the fan of {curves.MEMBERS} runs",
+    "box": "poles and margins over the box",
+    "proof": "the certificate",
+}
 
 
 class Page:
@@ -74,7 +85,10 @@ class Page:
                 with ui.element("section").classes("middle"):
                     self.title = ui.label().classes("title").props("data-id=title")
                     self.place = ui.element("div").classes("curves").props("data-id=curves")
-                    self.end_line = ui.label().classes("foot").props("data-id=end")
+                    self.path_place = ui.element("div")
+                    with ui.element("div").classes("foot"):
+                        self.end_line = ui.label().props("data-id=end")
+                        self.waiting_line = ui.label().classes("busy").props("data-id=waiting")
                 with ui.element("section").classes("right"):
                     self.tuner.build()
                     self.results.build()
@@ -86,9 +100,14 @@ class Page:
         self.oldest_valid, self.learned = self.version + 1, {}
         self.shown = None
         self.title.set_text(self.session.original.title or self.session.original.name)
-        self.end_line.set_text("compiling …")
+        self.end_line.set_text("")
+        self.waiting_line.set_text("")
         self.place.clear()
+        self.path_place.clear()
+        with self.place:
+            ui.label(PREPARING).classes("preparing").props("data-id=preparing")
         self.chart: Canvas | None = None
+        self.path_map: Canvas | None = None
         self.results.begin(self.session.original)
         self.tuner.begin()
         self.redraw()
@@ -120,6 +139,8 @@ class Page:
         if self.chart is not None:
             change = charts.change_curves(run, "before") if run else charts.clear_curves("before")
             self.chart.change(change)
+        if self.path_map is not None:
+            self.path_map.change(path_chart.change_path_before(run.path if run else None))
 
     def show_until_settled(self, *, whole: bool) -> None:
         """Fit the time axis to the transient of the current run, or with `whole` to the whole run."""
@@ -207,16 +228,22 @@ class Page:
                     self.begin()
                 self.show_refusal(refusal)
 
-    def _show_curves(self, run: Curves, now: Scenario, change: str, version: int, edit: int) -> None:
+    def _show_curves(self, run: Curves, now: Scenario, change: str, path_change: str, version: int, edit: int) -> None:
         if version < max(self.oldest_valid, self.drawn):
             return
         self.drawn: int = version
         self.session.accept(now.loop)
         if self.chart is None:
+            self.place.clear()
             with self.place:
                 self.chart = Canvas(charts.run_chart(run), "fill")
+            if run.path:
+                with self.path_place:
+                    self.path_map = Canvas(path_chart.path_chart(run.path), "path", "path")
         else:
             self.chart.send(change, edit)
+            if self.path_map is not None:
+                self.path_map.send(path_change)
         self.shown = run
         if version == self.version != self.refused_version:
             self.show_refusal(None)
@@ -235,6 +262,7 @@ class Page:
         if job == "run":
             self.results.measuring.set_visibility(False)
             if self.shown is None:
+                self.place.clear()
                 self.end_line.set_text("no run")
 
     def _learn(self, name: str, value: object, version: int) -> None:
@@ -255,6 +283,10 @@ class Page:
     def _show_loop_curves(self, loop_curves: stability.LoopCurves, version: int) -> None:
         if version >= self.oldest_valid:
             self.results.frequency.show(loop_curves)
+
+    def _show_waiting(self, words: str, version: int) -> None:
+        if version == self.version:
+            self.waiting_line.set_text(words)
 
     def _show_verdict(self, verdict: ProofVerdict, version: int) -> None:
         if version == self.version:
@@ -283,7 +315,8 @@ class Page:
         self.thinker.ask(partial(self._think, now, version))
 
     def _send(self, run: Curves, now: Scenario, version: int, edit: int = 0) -> None:
-        self.later(self._show_curves, run, now, encode_change(charts.change_curves(run)), version, edit)
+        path_change = encode_change(path_chart.change_path(run.path) if run.path else {})
+        self.later(self._show_curves, run, now, encode_change(charts.change_curves(run)), path_change, version, edit)
 
     def _think(self, now: Scenario, version: int) -> None:
         """Compute everything except the curve: quick results during a drag, the others after a rest."""
@@ -300,12 +333,23 @@ class Page:
                 self._send(curves.run_curves(now), now, version)
         for name in steps:
             if name not in quick and version == self.version:
+                self._say(name, version)
                 self._time_step(name, steps[name], now, version)
         if version == self.version and not self.box_current:
+            self._say("box", version)
             self._poles(now, version, box=True)
         if self._wait_for_rest(PROVING, version):
+            self._say("proof", version)
             self.later(self._show_verdict, _verdict(self.tools.prove, now), version)
+        self._say("", version)
         objections(now)  # compiles the check now, before the next edit needs it
+
+    def _say(self, name: str, version: int) -> None:
+        """Show what the page waits for; an empty name says that it waits for nothing."""
+        first = "" if name in self.learned else " (compiles at first)"
+        words = f"computing {STEP_WORDS[name]}{first} …" if name else ""
+        if version == self.version:
+            self.later(self._show_waiting, words, version)
 
     def _time_step(self, name: str, step: Callable[[Scenario, int], bool], now: Scenario, version: int) -> None:
         begun = time.monotonic()

@@ -18,10 +18,53 @@ class Curve(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """Curves of one unit; the fan belongs to the first curve."""
+    """Curves of one unit; the fan belongs to the first curve.
+
+    Attributes:
+        unit: Unit of all curves.
+        lines: Signals, then their targets and setpoints, or the commands, each in the order of the signals.
+        quantity: What the signals have in common, such as "slip" of wheels; empty if their names say it.
+    """
 
     unit: str
     lines: tuple[Curve, ...]
+    quantity: str = ""
+
+
+class Strip(NamedTuple):
+    """A part of a road seen from above, with one friction.
+
+    Attributes:
+        x: First and last place along the road [m].
+        y: Right and left edge [m].
+        friction: Greatest friction coefficient of its tyres [1].
+    """
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    friction: float
+
+
+class Path(NamedTuple):
+    """A run seen from above, in the axes of the road: x along it, y to the left.
+
+    Attributes:
+        t: Instants [s].
+        x: Places along the road [m].
+        y: Places to the left of the first heading [m].
+        yaw: Angles from the road to the heading [rad].
+        outlines: The vehicle at some instants, shape (vehicles, corners, 2) [m].
+        window: Limits (low, high) of x and y that are drawn [m].
+        strips: The road.
+    """
+
+    t: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    yaw: np.ndarray
+    outlines: np.ndarray
+    window: tuple[tuple[float, float], tuple[float, float]]
+    strips: tuple[Strip, ...]
 
 
 class Curves(NamedTuple):
@@ -33,6 +76,7 @@ class Curves(NamedTuple):
         metrics: Metrics by name.
         end: Sentence about the end of the run.
         draft: True for a quick run by another solver than the scenario's.
+        path: The run seen from above; None for a plant whose outputs have no path.
     """
 
     t: np.ndarray
@@ -40,6 +84,7 @@ class Curves(NamedTuple):
     metrics: dict[str, float]
     end: str
     draft: bool
+    path: Path | None = None
 
 
 class Fan(NamedTuple):

@@ -65,6 +65,14 @@ class Wheels(NamedTuple):
     rear_right: Scalar
 
 
+class WheelPlace(NamedTuple):
+    """Where a wheel is in the car's axes [m], x forward and y to the left, and its tyre."""
+
+    x: Scalar
+    y: Scalar
+    tyre: Tyre
+
+
 class CarState(NamedTuple):
     """Position [m], yaw [rad], velocities [m/s], yaw velocity [rad/s], steer angle [rad], spins of wheels [rad/s],
     contacts of relaxed tyres.
@@ -336,6 +344,11 @@ class Car(SlipProbes):
         u, v = state.longitudinal_velocity, state.lateral_velocity
         spins = sum(inertia * spin**2 for inertia, spin in zip(self._inertias(), state.spins, strict=True))
         return 0.5 * (self.mass * (u * u + v * v) + self.yaw_inertia * state.yaw_velocity**2 + spins)
+
+    def wheel_places(self) -> dict[str, WheelPlace]:
+        """Return position and tyre of each wheel by name, as a view from above draws them."""
+        places = zip(WHEELS, self._positions(), self._tyres(), strict=True)
+        return {wheel: WheelPlace(x, y, tyre) for wheel, (x, y), tyre in places}
 
     def usual_parts(self) -> dict[str, PyTree]:
         """Return the default parts of a loop until standstill: a PID on the slip of each wheel, and a driver.
