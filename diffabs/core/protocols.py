@@ -66,7 +66,7 @@ is that of the papers, so a stabilising K is negative. A balance leans to the si
 there, too.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from diffabs.core.messages import BalanceOutput as BalanceOutput
@@ -135,6 +135,31 @@ class Tyre(Protocol):
 
     def forces(self, slip: Scalar, slip_angle: Scalar, load: Scalar, speed: Scalar, distance: Scalar) -> TyreForces:
         """Return both forces for a wheel that moves at `slip_angle` [rad] to the left of its heading."""
+        ...
+
+
+class Pads(Protocol):
+    """The pads and discs of a car's brakes: one temperature for each brake, of the front first, or none."""
+
+    @property
+    def heated(self) -> bool:
+        """Whether there are temperatures, which the car then shows; a class attribute."""
+        ...
+
+    def start(self, brakes: int) -> tuple[Scalar, ...]:
+        """Return the temperatures at t = 0 [K]."""
+        ...
+
+    def torques(self, temperatures: Sequence[Scalar], commands: Sequence[Scalar]) -> tuple[Scalar, ...]:
+        """Return the brake torques [N m] that commands make."""
+        ...
+
+    def commands(self, temperatures: Sequence[Scalar], torques: Sequence[Scalar]) -> tuple[Scalar, ...]:
+        """Return the commands that make brake torques [N m]."""
+        ...
+
+    def heat_rates(self, temperatures: Sequence[Scalar], powers: Sequence[Scalar]) -> tuple[Scalar, ...]:
+        """Return the rates of the temperatures [K/s] under the powers of the brakes of single wheels [W]."""
         ...
 
 

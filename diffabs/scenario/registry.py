@@ -59,6 +59,7 @@ FAMILIES: dict[str, tuple[tuple[ModuleType, ...], frozenset[str]]] = {
     "plant": ((plants,), _methods(protocols.Plant)),
     "road": ((roads,), _methods(protocols.Road)),
     "tyre": ((roads,), _methods(protocols.Tyre)),
+    "pads": ((plants,), _methods(protocols.Pads)),
     "initial": ((plants,), frozenset()),
     "sensor": ((sensors, blocks), _methods(protocols.Block)),
     "reference": ((references,), _methods(protocols.Reference)),

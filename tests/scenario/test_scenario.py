@@ -219,7 +219,7 @@ def test_members_are_told_by_shape():
     assert set(registry.family_types("initial")) == {"brake-start", "balance-start", "tank-start"}
     assert {"burckhardt", "snow", "rig-unrounded", "spline-b"} <= set(registry.family_types("road"))
     assert not {"peak", "piecewise-cubic"} & set(registry.family_types("road"))
-    assert set(registry.family_types("tyre")) == {"road-tyre", "pacejka-tyre"}
+    assert set(registry.family_types("tyre")) == {"road-tyre", "pacejka-tyre", "relaxed-tyre"}
     assert "pid" in registry.family_types("controller")
     assert set(registry.family_types("antiwindup")) == {"no-anti-windup", "clamping", "back-calculation"}
     assert set(registry.family_types("feedforward")) == {"no-feedforward", "constant-input", "holding-input"}

@@ -228,7 +228,7 @@ WITH_CHANNELS: dict[str, dict[str, Any]] = {
     "plant": {
         "quadruple tank": plants.QuadrupleTank(share_1=0.43, share_2=0.34),
         "half car": plants.HalfCar(drag=0.4, rolling=0.01, rear_tyre=roads.PacejkaTyre(grip=0.7)),
-        "half car, relaxed": plants.HalfCar(front_tyre=roads.RelaxedTyre()),
+        "half car, relaxed": plants.HalfCar(front_tyre=roads.RelaxedTyre(), pads=plants.FadingPads(initial=700.0)),
         "car": plants.Car(drag=0.4, rolling=0.01, front_left_tyre=roads.PacejkaTyre(grip=0.7)),
     },
     "tyre": {
@@ -236,6 +236,7 @@ WITH_CHANNELS: dict[str, dict[str, Any]] = {
         "pacejka": roads.PacejkaTyre(grip=0.7),
         "relaxed": roads.RelaxedTyre(tyre=roads.PacejkaTyre(grip=0.7), length=0.2),
     },
+    "pads": {"constant": plants.ConstantPads(), "fading": plants.FadingPads(initial=700.0)},
     "initial": {"filled": plants.TankStart(level_1=0.1)},
     "controller": {
         "per channel": controllers.PerChannel({"pump_1": _PID, "pump_2": controllers.Relay()}, TANK),

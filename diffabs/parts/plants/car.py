@@ -22,6 +22,7 @@ Source: R. Rajamani, Vehicle Dynamics and Control, 2nd ed., sec. 8.3; the defaul
 Althoff and G. Wuersching, CommonRoad: Vehicle Models, 2020, with half of its axle's inertia for each wheel.
 """
 
+from collections import namedtuple
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple, Self
@@ -31,11 +32,12 @@ import jax.numpy as jnp
 
 from diffabs.core.channels import put_first
 from diffabs.core.numerics import larger, quotient
-from diffabs.core.protocols import BrakeOutput, Contact, Objective, Tyre, TyreForces
+from diffabs.core.protocols import BrakeOutput, Contact, Objective, Pads, Tyre, TyreForces
 from diffabs.core.pytree import param, part, pytree, static
 from diffabs.core.types import Any, PyTree, Scalar
 from diffabs.parts.controllers import PID, Clamping, HoldCourse, NoFeedforward, PerChannel, SelectLow
 from diffabs.parts.objectives import InChannel, LockedTime, PeakOutput, StopDistance, StopTime
+from diffabs.parts.plants.pads import ConstantPads
 from diffabs.parts.plants.wheel import (
     GRAVITY,
     BrakeStart,
@@ -75,7 +77,7 @@ class WheelPlace(NamedTuple):
 
 class CarState(NamedTuple):
     """Position [m], yaw [rad], velocities [m/s], yaw velocity [rad/s], steer angle [rad], spins of wheels [rad/s],
-    contacts of relaxed tyres.
+    contacts of relaxed tyres, temperatures of the discs [K].
     """
 
     x: Scalar
@@ -87,6 +89,7 @@ class CarState(NamedTuple):
     steer: Scalar
     spins: Wheels
     contacts: tuple[PyTree, ...] = ((), (), (), ())
+    temperatures: tuple[Scalar, ...] = ()
 
 
 class CarSignals(NamedTuple):
@@ -142,6 +145,18 @@ class CarOutput(CarSignals):
             return self._replace(**{name: output[0]})
         wheel_speed = f"{name.removesuffix('_slip')}_wheel_speed"
         return self._replace(**{name: output.slip, wheel_speed: output.wheel_speed})
+
+
+WHEEL_TEMPERATURES = tuple(f"{wheel}_brake_temperature" for wheel in WHEELS)
+
+
+class HeatedCarOutput(namedtuple("HeatedCarSignals", (*CarOutput._fields, *WHEEL_TEMPERATURES))):
+    """The outputs of a car with heated discs."""
+
+    __slots__ = ()
+    units: ClassVar[Mapping[str, str]] = MappingProxyType({**CarOutput.units, **dict.fromkeys(WHEEL_TEMPERATURES, "K")})
+    tracked, highest = CarOutput.tracked, CarOutput.highest
+    channel, with_channel = CarOutput.channel, CarOutput.with_channel
 
 
 class CarControlSignals(NamedTuple):
@@ -248,20 +263,28 @@ class Car(SlipProbes):
     """Tyre and road of the rear left wheel."""
     rear_right_tyre: Tyre = part(default=RoadTyre)
     """Tyre and road of the rear right wheel."""
+    pads: Pads = part(default=ConstantPads)
+    """Pads and discs of all wheels."""
 
-    shows = CarOutput
     controls = CarControls
+
+    @property
+    def shows(self) -> type[Any]:
+        """Type of the outputs; heated discs show their temperatures."""
+        return HeatedCarOutput if self.pads.heated else CarOutput
 
     def start(self, initial: BrakeStart) -> CarState:
         """Return the state of straight motion for a speed and a slip of all wheels."""
         spin, zero = (1 - initial.slip) * initial.speed / self.radius, 0.0 * initial.speed
         contacts = tuple(settled_contact(tyre, initial.slip) for tyre in self._tyres())
-        return CarState(zero, zero, zero, initial.speed, zero, zero, zero, Wheels(spin, spin, spin, spin), contacts)
+        spins, discs = Wheels(spin, spin, spin, spin), self.pads.start(brakes=4)
+        return CarState(zero, zero, zero, initial.speed, zero, zero, zero, spins, contacts, discs)
 
     def derivative(self, t: Scalar, state: CarState, control: CarControls) -> CarState:
         """Return dx/dt under brake torques [N m] and demanded steer angle [rad]."""
         del t
-        *torques, steer = control
+        *commands, steer = control
+        torques = self.pads.torques(state.temperatures, commands)
         contacts = self._contacts(state)
         forces_of_loads = self._forces_of_loads(contacts, state)
         loads = (
@@ -284,12 +307,16 @@ class Car(SlipProbes):
             (steer - state.steer) / self.steer_lag,
             Wheels(*spins),
             self._contact_rates(contacts, state),
+            self.pads.heat_rates(
+                state.temperatures, [torque * spin for torque, spin in zip(torques, state.spins, strict=True)]
+            ),
         )
 
     def least_scales(self) -> CarState:
         """Return the sizes below which errors are absolute: in straight motion y, yaw and steer angle are rounding."""
         contacts = tuple(map(least_contact, self._tyres()))
-        return CarState(1.0, 1.0, 0.1, 1.0, 0.1, 0.1, 0.1, Wheels(1.0, 1.0, 1.0, 1.0), contacts)
+        spins, discs = Wheels(1.0, 1.0, 1.0, 1.0), tuple(1.0 + 0.0 * heat for heat in self.pads.start(brakes=4))
+        return CarState(1.0, 1.0, 0.1, 1.0, 0.1, 0.1, 0.1, spins, contacts, discs)
 
     def project(self, state: CarState) -> CarState:
         """Return the state with neither car nor wheels moving backwards."""
@@ -298,13 +325,13 @@ class Car(SlipProbes):
             spins=Wheels(*map(forward_speed, state.spins)),
         )
 
-    def output(self, state: CarState) -> CarOutput:
+    def output(self, state: CarState) -> Any:
         """Return slips, wheel speeds, loads, accelerations and motion of the car."""
         contacts = self._contacts(state)
         forces_of_loads = self._forces_of_loads(contacts, state)
         loads = self._solve_loads(forces_of_loads, state)
         longitudinal, lateral = self._accelerations(state, self._sum_forces(forces_of_loads, loads, state))
-        return CarOutput(
+        return self.shows(
             *contacts.slips,
             *contacts.rims,
             *loads,
@@ -317,6 +344,7 @@ class Car(SlipProbes):
             state.x,
             state.y,
             state.steer,
+            *state.temperatures,
         )
 
     def holding(self, output: CarOutput, target: PyTree) -> CarControls:
@@ -331,7 +359,8 @@ class Car(SlipProbes):
             self.radius * force + (1 - slip) * inertia * deceleration / self.radius
             for force, slip, inertia in zip(road.braking, slips, self._inertias(), strict=True)
         ]
-        return CarControls(torques[0], torques[1], torques[2], torques[3], 0.0 * deceleration)
+        commands = self.pads.commands(output[len(CarOutput._fields) :], torques)
+        return CarControls(commands[0], commands[1], commands[2], commands[3], 0.0 * deceleration)
 
     def loads(self, braking: Scalar, lateral: Scalar) -> Wheels:
         """Return the vertical forces of the wheels [N] under the road's forces X and Y [N]."""
@@ -430,10 +459,10 @@ class Car(SlipProbes):
     def _forces_of_loads(self, contacts: Contacts, state: CarState) -> list[ForceOfLoad]:
         """Return the force of each wheel as a function of its load; proportional tyres are evaluated here, once."""
         speed = self._total_velocity(state)
-        slips = (contact or motion for contact, motion in zip(state.contacts, contacts.each(), strict=True))
+        followed = (contact or motion for contact, motion in zip(state.contacts, contacts.each(), strict=True))
         return [
-            _force_of_load(tyre, *slip_and_angle, speed, place)
-            for tyre, slip_and_angle, place in zip(self._tyres(), slips, contacts.places, strict=True)
+            _force_of_load(tyre, contact, speed, place)
+            for tyre, contact, place in zip(self._tyres(), followed, contacts.places, strict=True)
         ]
 
     def _contact_rates(self, contacts: Contacts, state: CarState) -> tuple[PyTree, ...]:
@@ -511,9 +540,9 @@ def _turn_force(force: TyreForces, steer: Scalar | None) -> TyreForces:
     )
 
 
-def _force_of_load(tyre: Tyre, slip: Scalar, slip_angle: Scalar, speed: Scalar, place: Scalar) -> ForceOfLoad:
+def _force_of_load(tyre: Tyre, contact: Contact, speed: Scalar, place: Scalar) -> ForceOfLoad:
     """Return the force of a tyre as a function of its load."""
     if not tyre.proportional:
-        return lambda load: tyre.forces(slip, slip_angle, load, speed, place)
-    friction = tyre.forces(slip, slip_angle, 1.0, speed, place)
+        return lambda load: tyre.forces(*contact, load, speed, place)
+    friction = tyre.forces(*contact, 1.0, speed, place)
     return lambda load: TyreForces(load * friction.braking, load * friction.lateral)

@@ -16,6 +16,7 @@ named as in ISO 8855:2011. The default numbers are vehicle 2 (BMW 320i) of M. Al
 Vehicle Models, 2020.
 """
 
+from collections import namedtuple
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple, Self
@@ -25,11 +26,12 @@ import jax.numpy as jnp
 
 from diffabs.core.channels import put_first
 from diffabs.core.numerics import quotient
-from diffabs.core.protocols import BrakeOutput, Contact, Objective, Tyre
+from diffabs.core.protocols import BrakeOutput, Contact, Objective, Pads, Tyre
 from diffabs.core.pytree import param, part, pytree, static
 from diffabs.core.types import Any, PyTree, Scalar
 from diffabs.parts.controllers import PID, Clamping, NoFeedforward, PerChannel
 from diffabs.parts.objectives import BRAKING, InChannel, StopDistance, StopTime
+from diffabs.parts.plants.pads import ConstantPads
 from diffabs.parts.plants.wheel import (
     GRAVITY,
     BrakeStart,
@@ -50,13 +52,16 @@ CHANNELS = {"front_brake": "front_slip", "rear_brake": "rear_slip"}
 
 
 class HalfCarState(NamedTuple):
-    """Speed [m/s], angular speeds of the axles [rad/s], distance of the front axle [m], contacts of relaxed tyres."""
+    """Speed [m/s], angular speeds of the axles [rad/s], distance of the front axle [m], contacts of relaxed tyres, and
+    temperatures of the discs [K].
+    """
 
     speed: Scalar
     front_spin: Scalar
     rear_spin: Scalar
     distance: Scalar
     contacts: tuple[PyTree, ...] = ((), ())
+    temperatures: tuple[Scalar, ...] = ()
 
 
 class HalfCarSignals(NamedTuple):
@@ -98,6 +103,20 @@ class HalfCarOutput(HalfCarSignals):
             return self._replace(**{name: output[0]})
         axle = name.removesuffix("_slip")
         return self._replace(**{name: output.slip, f"{axle}_wheel_speed": output.wheel_speed})
+
+
+AXLE_TEMPERATURES = ("front_brake_temperature", "rear_brake_temperature")
+
+
+class HeatedHalfCarOutput(namedtuple("HeatedHalfCarSignals", (*HalfCarOutput._fields, *AXLE_TEMPERATURES))):
+    """The outputs of a half car with heated discs."""
+
+    __slots__ = ()
+    units: ClassVar[Mapping[str, str]] = MappingProxyType(
+        {**HalfCarOutput.units, **dict.fromkeys(AXLE_TEMPERATURES, "K")}
+    )
+    tracked, highest = HalfCarOutput.tracked, HalfCarOutput.highest
+    channel, with_channel = HalfCarOutput.channel, HalfCarOutput.with_channel
 
 
 class AxleBrakeSignals(NamedTuple):
@@ -170,49 +189,61 @@ class HalfCar(SlipProbes):
     """Tyre and road of the front axle."""
     rear_tyre: Tyre = part(default=RoadTyre)
     """Tyre and road of the rear axle."""
+    pads: Pads = part(default=ConstantPads)
+    """Pads and discs of all wheels."""
 
-    shows = HalfCarOutput
     controls = AxleBrakes
     frozen = ("speed", "distance")
+
+    @property
+    def shows(self) -> type[Any]:
+        """Type of the outputs; heated discs show their temperatures."""
+        return HeatedHalfCarOutput if self.pads.heated else HalfCarOutput
 
     def start(self, initial: BrakeStart) -> HalfCarState:
         """Return the state for a speed and a slip of both axles."""
         spin = (1 - initial.slip) * initial.speed / self.radius
         contacts = tuple(settled_contact(tyre, initial.slip) for tyre in self._tyres())
-        return HalfCarState(initial.speed, spin, spin, 0.0 * initial.speed, contacts)
+        return HalfCarState(initial.speed, spin, spin, 0.0 * initial.speed, contacts, self.pads.start(brakes=2))
 
     def derivative(self, t: Scalar, state: HalfCarState, control: AxleBrakes) -> HalfCarState:
         """Return dx/dt under the brake torques [N m]."""
         del t
         force = self._braking_force(state)
-        loads = self.loads((control.front_brake + control.rear_brake) / self.radius if self.commanded else force)
+        torques = AxleBrakes(*self.pads.torques(state.temperatures, control))
+        loads = self.loads(sum(torques) / self.radius if self.commanded else force)
         front, rear = self._tyre_forces(state, loads)
         rolling = self._rolling_force(state.speed)
         return HalfCarState(
             halt_at_zero(state.speed, -self._deceleration(state.speed, front + rear + rolling)),
-            halt_at_zero(state.front_spin, quotient(self.radius * front - control.front_brake, self.front_inertia)),
-            halt_at_zero(state.rear_spin, quotient(self.radius * rear - control.rear_brake, self.rear_inertia)),
+            halt_at_zero(state.front_spin, quotient(self.radius * front - torques.front_brake, self.front_inertia)),
+            halt_at_zero(state.rear_spin, quotient(self.radius * rear - torques.rear_brake, self.rear_inertia)),
             state.speed,
             tuple(
                 contact_rate(tyre, contact, Contact(slip, 0.0 * slip), state.speed)
                 for tyre, contact, slip in zip(self._tyres(), state.contacts, self._slips(state), strict=True)
             ),
+            self.pads.heat_rates(
+                state.temperatures,
+                (0.5 * torques.front_brake * state.front_spin, 0.5 * torques.rear_brake * state.rear_spin),
+            ),
         )
 
     def least_scales(self) -> HalfCarState:
         """Return the sizes below which errors are absolute: those of contacts, which begin at 0."""
-        return HalfCarState(0.0, 0.0, 0.0, 0.0, tuple(map(least_contact, self._tyres())))
+        discs = tuple(0.0 * temperature for temperature in self.pads.start(brakes=2))
+        return HalfCarState(0.0, 0.0, 0.0, 0.0, tuple(map(least_contact, self._tyres())), discs)
 
     def project(self, state: HalfCarState) -> HalfCarState:
         """Return the state with neither car nor axles moving backwards."""
         front, rear = forward_speed(state.front_spin), forward_speed(state.rear_spin)
         return state._replace(speed=forward_speed(state.speed), front_spin=front, rear_spin=rear)
 
-    def output(self, state: HalfCarState) -> HalfCarOutput:
+    def output(self, state: HalfCarState) -> Any:
         """Return slips [1], speeds [m/s], deceleration [m/s^2], loads [N] and distance [m]."""
         force = self._braking_force(state)
         slips, loads = self._slips(state), self.loads(force)
-        return HalfCarOutput(
+        return self.shows(
             *slips,
             state.speed,
             self.radius * state.front_spin,
@@ -220,6 +251,7 @@ class HalfCar(SlipProbes):
             self._deceleration(state.speed, force),
             *loads,
             state.distance,
+            *state.temperatures,
         )
 
     def holding(self, output: HalfCarOutput, target: PyTree) -> AxleBrakes:
@@ -230,12 +262,11 @@ class HalfCar(SlipProbes):
         deceleration = self._deceleration(output.speed, force)
         forces = self._forces(slips, places, output.speed, self.loads(force))
         inertias = Axles(self.front_inertia, self.rear_inertia)
-        return AxleBrakes(
-            *(
-                self.radius * axle_force + (1 - slip) * inertia * deceleration / self.radius
-                for axle_force, slip, inertia in zip(forces, slips, inertias, strict=True)
-            )
-        )
+        torques = [
+            self.radius * axle_force + (1 - slip) * inertia * deceleration / self.radius
+            for axle_force, slip, inertia in zip(forces, slips, inertias, strict=True)
+        ]
+        return AxleBrakes(*self.pads.commands(output[len(HalfCarOutput._fields) :], torques))
 
     def loads(self, force: Scalar) -> Axles:
         """Return the vertical forces of the axles [N] under the road's whole force against the motion [N]."""
@@ -279,6 +310,10 @@ class HalfCar(SlipProbes):
 
     def _tyres(self) -> tuple[Tyre, ...]:
         return self.front_tyre, self.rear_tyre
+
+    def _disc_powers(self, state: HalfCarState, torques: AxleBrakes) -> tuple[Scalar, Scalar]:
+        """Return the power of each of the two brakes of both axles [W]."""
+        return 0.5 * torques.front_brake * state.front_spin, 0.5 * torques.rear_brake * state.rear_spin
 
     def _contact_slips(self, state: HalfCarState) -> Axles:
         """Return the slips to which the forces belong: those of the axles, or of the contacts of relaxed tyres."""

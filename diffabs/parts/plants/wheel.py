@@ -67,7 +67,7 @@ def least_contact(tyre: Tyre) -> PyTree:
     return Contact(LEAST_CONTACT, LEAST_CONTACT) if hasattr(tyre, "relax") else ()
 
 
-def contact_rate(tyre: Tyre, contact: PyTree, motion: Contact, speed: Scalar) -> PyTree:
+def contact_rate(tyre: Part, contact: PyTree, motion: Contact, speed: Scalar) -> PyTree:
     """Return d(contact)/dt for slip and slip angle of the wheel and the vehicle's speed [m/s]."""
     return tyre.relax(contact, *motion, speed) if contact else ()
 
