@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from diffabs.cli import console, show, show_margins, targets
+from diffabs.cli import certificates, console, show, show_margins, targets
+from diffabs.cli.options import read_sides
 from diffabs.core.pytree import ParameterSpec, replace
 from diffabs.core.types import JsonObject
 from diffabs.host import documents, provenance
@@ -46,17 +47,30 @@ def margins(
             help="Show beside the worst what this file of certify --sensitivity proves, checked again.",
         ),
     ] = None,
+    bounds: Annotated[
+        bool,
+        typer.Option(
+            "--bounds",
+            help="Bound the greatest |S| and |T| over the ranges from above, too; the extra design is needed.",
+        ),
+    ] = False,
+    over: Annotated[
+        list[str] | None,
+        typer.Option("--over", metavar="PATH=LOW:HIGH", help="Range of --bounds; default: those of [design.over]."),
+    ] = None,
     as_json: console.Json = False,
 ) -> None:
     """Compute stability margins of the linearised loop.
 
     It shows gain, phase, delay and modulus margin of the scenario, and the worst over [design.over]. A plant with
-    several controls has them for each channel, with the others closed, and the least singular value of I + L."""
+    several controls has them for each channel, with the others closed, and the least singular value of I + L. With
+    --bounds: the greatest |S| and |T| found in a box, and bounds for constant and for varying parameters."""
     with console.end_on_errors():
         targets.check_picture(plot)
         with targets.new_target_file(plot, "--plot") as picture:
             setup = console.load_scenario(scenario, changes, integrated=False)
             values, target = _read_places(setup, at or ())
+            box = _read_box(setup, over or (), bounds, values, target)
             if picture or proof or setup.design.over:
                 option = "margins --plot" if picture else "margins --proof" if proof else "margins over [design.over]"
                 console.refuse_several_controls(setup, option)
@@ -72,6 +86,7 @@ def margins(
             result = documents.stamp("margins", result)
             proved = _read_proof(proof, margin_results, setup, values) if proof else {}
             result["proved"] = proved
+            result["bounds"] = _bound_peaks(setup, values, box) if bounds else {}
             has_channels = isinstance(margin_results, ScenarioChannelMargins)
             view = show_margins.show_channel_margins if has_channels else show_margins.show_margins
             show_result = partial(show.show_result, as_json, view, result, setup, margin_results)
@@ -81,6 +96,35 @@ def margins(
         result["files"] |= {"plot": str(plot)} if plot else {}
         show_result()
         _judge(setup, margin_results)
+
+
+def _read_box(
+    setup: Scenario, over: Sequence[str], bounds: bool, values: dict[str, float], target: float | None
+) -> dict[str, tuple[float, float]]:
+    """Return the ranges of --bounds by path, in SI."""
+    if over and not bounds:
+        console.fail("--over goes with --bounds; other ranges are those of [design.over]")
+    if not bounds:
+        return {}
+    if target is not None:
+        console.fail("--at target does not go with --bounds: set the reference of the loop")
+    ranges = {side.path: side.ends for side in read_sides(over, setup)} if over else setup.design.ranges(setup.loop)
+    box = {path: ends for path, ends in ranges.items() if path not in values}
+    if not box:
+        console.fail("--bounds needs ranges: --over PATH=LOW:HIGH, or [design.over]")
+    return box
+
+
+def _bound_peaks(setup: Scenario, values: dict[str, float], box: dict[str, tuple[float, float]]) -> JsonObject:
+    """Return the bounds of the peaks of S and T by name, as JSON values."""
+    from diffabs.robust.frequency import peaks as bounded
+
+    with certificates.report_design_errors():
+        peaks = console.run_with_progress(
+            lambda: bounded.bound_peaks(replace(setup.loop, values), box), f"bounding the peaks of {setup.name}"
+        )
+    ranges = {path: list(ends) for path, ends in box.items()}
+    return {"over": ranges, **{name: peak.record() for name, peak in peaks.items()}}
 
 
 def _read_proof(

@@ -22,6 +22,7 @@ SHORT_NAMES = {
     **{"gain_up": "gain up", "gain_down": "gain down", "phase": "phase [deg]", "delay": "delay [ms]"},
     **{"modulus": "1/Ms", "complementary": "Mt", "crossover": "crossover [rad/s]"},
 }
+SHOWN_PEAKS, BOUND_NAMES = ("sensitivity", "complementary"), ("constant", "varying")
 SHOWN_IN = {"phase": math.degrees(1), "delay": 1e3}
 
 
@@ -38,6 +39,7 @@ def show_margins(result: JsonObject, scenario: Scenario, margins: ScenarioMargin
             row += [""] * (len(columns) - len(row)) + ([format_bound(name, proved[name])] if name in proved else [])
         table.add_row(words, *row)
     tables.show_titled_table(_title(result, scenario), table)
+    show_bounds(result, scenario)
     _show_notes(result, scenario)
 
 
@@ -55,7 +57,41 @@ def show_channel_margins(result: JsonObject, scenario: Scenario, margins: Scenar
             table.add_row(place, *map(_format_number, values))
     tables.show_titled_table("All channels together", table)
     console.say("s(I + L): singular value of the return difference, 1/Ms; disk margin: each channel changes by itself")
+    show_bounds(result, scenario)
     _show_notes(result, scenario)
+
+
+def show_bounds(result: JsonObject, scenario: Scenario) -> None:
+    """Show a table of the greatest |S| and |T| found in a box and of their bounds, if there are any."""
+    bounds, proved = result["bounds"], result["proved"]
+    if not bounds:
+        return
+    columns = ["proved"] if proved else []
+    table = Table("peak", "found", "where", "constant parameters", "varying parameters", *columns)
+    for name, symbol in (("sensitivity", "|S|"), ("complementary", "|T|")):
+        peak = bounds[name]
+        shown = [_format_upper(peak["constant"]), _format_upper(peak["varying"])]
+        shown += [format_bound(name, proved[name]) if name in proved else ""] if proved else []
+        reached = "unstable" if peak["reached"] == "inf" else f"{peak['reached']:.5g}"
+        table.add_row(symbol, reached, format_place(peak["values"], scenario), *shown)
+    tables.show_titled_table("Greatest |S| and |T| over the ranges, at all frequencies", table)
+    first = bounds["sensitivity"]
+    console.say(
+        "constant parameters: the bound of mu; varying parameters: a common Lyapunov matrix, at any rate of change"
+    )
+    if first["no_common"]:
+        console.say("varying parameters: proved that no common Lyapunov matrix exists")
+    if first["vertices"]:
+        count = f"{first['vertices']} vertices that cover {first['coverage']['checked']} checked systems"
+        times = {name: sum(bounds[peak]["seconds"].get(name, 0.0) for peak in SHOWN_PEAKS) for name in BOUND_NAMES}
+        spent = ", ".join(f"{name} {seconds:.2g} s" for name, seconds in times.items())
+        console.say(f"both bounds are about the hull of {count}; {spent}")
+
+
+def _format_upper(bound: float | str | None) -> str:
+    if bound is None:
+        return "undecided"
+    return "no bound" if bound == "inf" else format_bound("sensitivity", float(bound))
 
 
 def _title(result: JsonObject, scenario: Scenario) -> str:

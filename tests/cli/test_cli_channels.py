@@ -12,6 +12,8 @@ from seams import replace_seam
 
 from diffabs.loop.batch import Batch
 from diffabs.loop.ensemble import run_batch
+from diffabs.robust.design.polytopes import Coverage
+from diffabs.robust.frequency import PeakBounds
 from diffabs.scenario.scenario import dump, load, loads
 
 HERE = ROOT / "examples" / "two-inputs"
@@ -103,6 +105,35 @@ def test_what_does_not_go_is_refused_in_a_line(name):
     result = run(*words, status=2)
     assert_one_error_line(result)
     assert line in result.stderr
+
+
+@killed_by("cli.margins", "if path not in values}\n    if not box:", "}\n    if not box:")
+def test_bounds_stand_beside_what_is_found(monkeypatch):
+    """The box is that of --over without what --at fixes; a bound is rounded up, and one that does not exist is said."""
+    boxes = []
+
+    def bound(loop, over):
+        boxes.append((loop.plant.share_2, over))
+        values = dict.fromkeys(over, 0.65)
+        times = {"ascents": 1.0, "hull": 2.0, "constant": 3.0, "varying": 4.0}
+        whole = PeakBounds(1.23, values, 0.05, 1.234561, 0.06, np.inf, True, 9, 4, Coverage(100, 0.9, 1.0), times)
+        return {"sensitivity": whole, "complementary": whole._replace(constant=np.nan)}
+
+    replace_seam(monkeypatch, "bound_peaks", bound)
+    words = ("margins", "quadruple-tank", "--bounds", "--at", "plant.share_2=0.61")
+    ranges = ("--over", "plant.share_1=0.6:0.7", "--over", "plant.share_2=0.5:0.6")
+    shown = run(*words, *ranges).output
+    assert "1.23" in shown
+    assert "at most 1.2346" in shown
+    assert shown.count("no bound") == 2
+    assert "undecided" in shown
+    assert "proved that no common Lyapunov matrix exists" in shown
+    assert "4 vertices that cover 100 checked systems; constant 6 s, varying 8 s" in shown
+    document = json.loads(run(*words, *ranges, "--json").stdout)["bounds"]
+    assert document["over"]["plant.share_1"] == pytest.approx([0.6, 0.7])
+    assert document["sensitivity"]["varying"] == "inf"
+    assert document["complementary"]["constant"] is None
+    assert [(share, list(over)) for share, over in boxes] == [(0.61, ["plant.share_1"])] * 2
 
 
 def test_the_page_is_the_example():

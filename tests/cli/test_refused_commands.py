@@ -90,6 +90,9 @@ REFUSALS = [
         2,
         ["parameter of the linear model, but not of this loop: remove it from [design.over]"],
     ),
+    ("margins slip-lmi --over plant.mass=5:6", 2, ["--over goes with --bounds"]),
+    ("margins slip-lmi --bounds --at target=0.2 --over plant.mass=5:6", 2, ["--at target does not go with --bounds"]),
+    ("margins quadruple-tank --bounds", 2, ["--bounds needs ranges: --over PATH=LOW:HIGH, or [design.over]"]),
     # export
     ("export slip-cured --to cc", 2, ["error: --to: 'cc' is not one of 'c', 'st', 'fmu'"]),
     ("export slip-cured --given slip", 2, ["error: --given: 'slip' is not one of 'target'"]),

@@ -27,6 +27,7 @@ SEAMS = {
     "max_vertices": "diffabs.robust.design.parameter_box.MAX_VERTICES",
     "polytope": "diffabs.robust.design.parameter_box.polytope",
     "as_uncertain_dyadic": "diffabs.robust.design.proof.exact.as_uncertain_dyadic",
+    "bound_peaks": "diffabs.robust.frequency.peaks.bound_peaks",
     "solve_sdp": "diffabs.robust.design.sdp.solver.solve_sdp",
     "design": "diffabs.robust.design.synthesis.design",
     "members": "diffabs.output.explore.curves.MEMBERS",
