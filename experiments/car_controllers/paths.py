@@ -14,9 +14,9 @@ from diffabs.output import plot
 from diffabs.scenario import load
 
 CASES = {  # by what the page says of them
-    "rear brakes select-low, a driver": [],
-    "rear brakes select-low, hands off": ["controller.gain=0"],
-    "each rear wheel by itself, a driver": ["controller.controller.groups=[]"],
+    "select-low at the rear, a driver": [],
+    "select-low, hands off": ["controller.gain=0"],
+    "each rear wheel by itself": ["controller.controller.groups=[]"],
 }
 TIMES = 6  # outlines of each car
 SIZE = (4.2, 1.7)  # m, of the outline
@@ -33,11 +33,10 @@ def follow(changes: list[str]) -> tuple[np.ndarray, ...]:
 
 def draw_paths(paths: dict[str, tuple[np.ndarray, ...]]) -> Any:
     """Return the figure of the paths, with the outline of each car at equal distances."""
-    figure, axes = plot.sheet(
-        len(paths), 1, title="From 50 km/h: asphalt on the left, snow on the right", size=(7.2, 1.5)
-    )
+    title = "From 50 km/h: asphalt on the left, snow on the right"
+    figure, axes = plot.sheet(1, len(paths), title=title, size=(3.2, 1.9), sharey=True)
     corners = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1)]) * np.array(SIZE) / 2
-    for ax, (words, (x, y, yaw)) in zip(np.ravel(axes), paths.items(), strict=True):
+    for ax, (words, (x, y, yaw)) in zip(axes, paths.items(), strict=True):
         ax.axhspan(-6.0, 0.0, color="#dce9f2")
         ax.axhspan(0.0, 9.0, color="#e3e3e3")
         ax.plot(x, y, color=plot.COLOURS[0])
@@ -47,7 +46,7 @@ def draw_paths(paths: dict[str, tuple[np.ndarray, ...]]) -> Any:
         ax.set_aspect("equal")
         ax.set_xlim(-3.0, 26.0)
         ax.set_ylim(-3.0, 6.0)
-        plot.label_axes(ax, "x [m]" if ax is np.ravel(axes)[-1] else "", "y [m]", words)
+        plot.label_axes(ax, "x [m]", "y [m]" if ax is axes[0] else "", words)
     return figure
 
 
