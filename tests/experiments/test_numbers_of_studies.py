@@ -175,6 +175,16 @@ def gains_of_rules(tables):
     return printed
 
 
+def norms_of_static_gains(tables):
+    def cells(row):
+        sizes = f"{row['states']}, {row['controls']}, {row['measurements']}"
+        norms = [f"{row[name]:.5g}" for name in ("HIFOO", "norm")]
+        counts = [f"{row[name]:,}" for name in ("evaluations of HIFOO", "evaluations")]
+        return [sizes, *norms, f"{row['norm / HIFOO']:.4f}", *counts, str(row["starts that agree"])]
+
+    return {row["plant"]: cells(row) for row in tables["rows"]}
+
+
 def stops_of_controllers(tables):
     def cells(row):
         percent = [f"{row[name]:.1f} %" for name in row if "over least" in name]
@@ -196,6 +206,7 @@ def stops_of_controllers(tables):
         ("slip_estimator", distances_behind_an_edge),
         ("overshoot_cured", overshoots_at_weak_spots),
         ("pid_over_roads", distances_over_roads),
+        ("hinf_published", norms_of_static_gains),
         ("pid_published", gains_of_rules),
         ("two_wheeler", recovered_by_two_angles),
         ("two_wheeler", recovered_by_weights),
