@@ -163,6 +163,7 @@ DEAR = (  # some seconds of compiling
         "diffabs.uncertainty.sweep.run.sweep",
         "diffabs.tune.identify.identification.identify",
         "diffabs.robust.reach.cover.cover_box",
+        "diffabs.robust.frequency.peaks.bound_peaks",
         "diffabs.scenario.proofs.prove_box",
     ),
     *("diffabs.engine.solve.solve", "diffabs.loop.run.rollout"),
