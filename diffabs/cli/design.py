@@ -124,7 +124,6 @@ def _certify_margins(
     from diffabs.scenario.frequency_proofs import prove_frequency
 
     setup = console.load_scenario(scenario, changes, integrated=False)
-    console.refuse_several_controls(setup, "certify")
     claims = [] if sensitivity is None else [FrequencyClaim(sensitivity)]
     claims += [] if delay_margin is None else [FrequencyClaim(math.inf, read_time(delay_margin, "--delay-margin"))]
     box = {side.path: side.ends for side in read_sides(over, setup)} if over else setup.design.ranges(setup.loop)

@@ -116,7 +116,7 @@ def prove_frequency(
     """Return what can be proved of claims about a loop over a box and all frequencies.
 
     Args:
-        loop: Loop with one control.
+        loop: Loop; a sampled one has one control.
         over: Range (low, high) of each parameter of the box, by path, in SI units.
         claims: Statements to decide.
         target: Setpoint; None for the loop's own.

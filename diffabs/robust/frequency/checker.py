@@ -12,7 +12,7 @@ A cell that fails is halved a few times: balls are slightly wider than intervals
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -52,12 +52,24 @@ class _Number(NamedTuple):
         return _Number(-self.value, [-a for a in self.slopes])
 
 
-class _Coefficients(NamedTuple):
-    """P and B as polynomials in s with their derivatives along the parameters, and the delay [s]."""
+class _Part(NamedTuple):
+    """P det (I + L)[J, I] for rows J and columns I, a sum of polynomials in s times e^(-s tau d), d = 0, 1, ..."""
 
-    poles: list[_Number]
-    zeros: list[_Number]
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
+    turned: list[list[_Number]]
+
+
+class _Coefficients(NamedTuple):
+    """All parts, P first and N last, and the delay [s]; numbers have derivatives along the parameters."""
+
+    parts: list[_Part]
     delay: _Number
+
+    @property
+    def degree(self) -> int:
+        """Degree n of P."""
+        return len(self.parts[0].turned[0]) - 1
 
 
 class LoopChecker:
@@ -129,24 +141,27 @@ class LoopChecker:
         """Return f and its derivatives along the frequency, the parameters and the added delay."""
         s, rate = self._variable(w)
         powers = [acb(1)]
-        for _ in c.poles:
+        for _ in range(c.degree + 1):
             powers.append(powers[-1] * s)
-        n = len(c.poles)
-        p, b = (sum((x.value * powers[k] for k, x in enumerate(y)), acb(0)) for y in (c.poles, c.zeros))
-        turn = (acb(0, -1) * w * c.delay.value).exp()
-        closed = p + b * turn
-        value = _size(closed) - self.square * _size(p)
-        if not slopes:
-            return value, []
-        dp, db = (
-            sum((k * x.value * powers[k - 1] for k, x in enumerate(y) if k), acb(0)) * rate for y in (c.poles, c.zeros)
-        )
-        moves = [(dp, dp + (db - acb(0, 1) * c.delay.value * b) * turn)]
-        for j in range(self.count):
-            dp = sum((c.poles[k].slopes[j] * powers[k] for k in range(n)), acb(0))
-            db = sum((c.zeros[k].slopes[j] * powers[k] for k in range(n)), acb(0))
-            moves.append((dp, dp + (db - acb(0, 1) * w * c.delay.slopes[j] * b) * turn))
-        return value, [2 * (_inner(closed, dn) - self.square * _inner(p, dp)) for dp, dn in moves]
+        controls = len(c.parts[-1].rows)
+        turns = [(acb(0, -d) * w * c.delay.value).exp() for d in range(controls + 1)]
+        value, moves = arb(0), [arb(0)] * (self.count + 1)
+        for part in c.parts:
+            weight = (-self.square) ** (controls - len(part.rows))
+            sums = [_sum(y, powers) for y in part.turned]
+            whole = sum((x * turns[d] for d, x in enumerate(sums)), acb(0))
+            value += weight * _size(whole)
+            if not slopes:
+                continue
+            derivatives = [acb(0)] * (self.count + 1)
+            for d, y in enumerate(part.turned):
+                by_s = sum((k * x.value * powers[k - 1] for k, x in enumerate(y) if k), acb(0))
+                derivatives[0] += (by_s * rate - acb(0, d) * c.delay.value * sums[d]) * turns[d]
+                for j in range(self.count):
+                    by_j = sum((x.slopes[j] * powers[k] for k, x in enumerate(y)), acb(0))
+                    derivatives[j + 1] += (by_j - acb(0, d) * w * c.delay.slopes[j] * sums[d]) * turns[d]
+            moves = [a + 2 * weight * _inner(whole, b) for a, b in zip(moves, derivatives, strict=True)]
+        return value, moves
 
     def _variable(self, w: arb) -> tuple[acb, acb]:
         """Return s and ds/dw."""
@@ -162,10 +177,15 @@ class LoopChecker:
         with _precision():
             try:
                 c = self.over(box)
-                n, inverse = len(c.poles) - 1, 1 / arb(top)
-                below = sum((c.poles[k].value.abs_upper() * inverse ** (n - k) for k in range(n)), arb(0))
-                above = sum((x.value.abs_upper() * inverse ** (n - k) for k, x in enumerate(c.zeros)), arb(0))
-                if top > 0 and ((1 - self.share) * (1 - below) - above).lower() > 0:
+                n, inverse = c.degree, 1 / arb(top)
+
+                def size(polynomial: list[_Number]) -> arb:
+                    return sum((x.value.abs_upper() * inverse ** (n - k) for k, x in enumerate(polynomial)), arb(0))
+
+                below = size(c.parts[0].turned[0][:-1])
+                gain = sum((size(part.turned[1]) for part in c.parts if len(part.rows) == 1), arb(0))
+                change = below + sum(map(size, c.parts[-1].turned[1:]), arb(0))  # of N/(jw)^n from 1
+                if top > 0 and ((1 - self.share) * (1 - below) - gain).lower() > 0 and change.upper() < 1:
                     return
                 reason = "the gain may be too large"
             except (Undefined, ZeroDivisionError) as error:
@@ -197,8 +217,8 @@ class LoopChecker:
     def _count_unstable(self, c: _Coefficients, top: float) -> arb:
         def difference(w: arb) -> acb:
             s, _ = self._variable(w)
-            p, b = (sum((x.value * s**k for k, x in enumerate(y)), acb(0)) for y in (c.poles, c.zeros))
-            return p + b * (acb(0, -1) * w * c.delay.value).exp()
+            powers, turn = [s**k for k in range(c.degree + 1)], (acb(0, -1) * w * c.delay.value).exp()
+            return sum((_sum(y, powers) * turn**d for d, y in enumerate(c.parts[-1].turned)), acb(0))
 
         edges = [0.0, *(top * 2.0**-k for k in reversed(range(TURN_PARTS)))]
         turned, stack = arb(0), [(low, high, 0) for low, high in pairwise(edges)]
@@ -212,7 +232,7 @@ class LoopChecker:
                 stack += [(low, middle, depth + 1), (middle, high, depth + 1)]
             else:  # a rectangle without 0 lies in a half plane, so the angle turns by less than pi
                 turned += (difference(arb(high)) / difference(arb(low))).arg()
-        n, pi = len(c.poles) - 1, arb.pi()
+        n, pi = c.degree, arb.pi()
         if self.equations.period is None:
             turned -= (difference(arb(top)) / acb(0, 1) ** n).arg()
             return (n - 2 * turned / pi) / 2
@@ -244,7 +264,7 @@ class LoopChecker:
             whole = _Number(balls.constant(e.period) * self.whole, [arb(0)] * count)
             a, b, c = self._sample(a, b, c, delay.plus(whole.negative()) if self.broken else None)
             delay = _Number(balls.constant(e.period) * (self.whole + self.broken), whole.slopes)
-        return _Coefficients(*_polynomials(a, b, c, f, g, h, j, count), delay)
+        return _Coefficients(_list_parts(a, b, c, f, g, h, j, count), delay)
 
     def _sample(self, a: Any, b: Any, c: Any, rest: _Number | None) -> tuple[Any, Any, Any]:
         """Return the sampled plant (A - I, B, C); behind the rest of a delay the inputs are u and s u, a period old."""
@@ -287,7 +307,8 @@ class LoopChecker:
         if not e.unknown:
             return []
         rows = [*range(len(e.rest))]
-        choices = [[i for i in rows if i != row] for row in rows[len(rows) - e.spare :]] if e.spare else [rows]
+        spare = combinations(rows[len(rows) - e.spare :], len(rows) - len(e.unknown))
+        choices = [[i for i in rows if i not in left_out] for left_out in spare]
         reasons = []
         for choice in choices:
             try:
@@ -504,17 +525,21 @@ def _decide(name: str, x: arb, y: arb) -> bool | None:
     return True if yes else False if no else None
 
 
-def _polynomials(
-    a: Any, b: Any, c: Any, f: Any, g: Any, h: Any, j: Any, count: int
-) -> tuple[list[_Number], list[_Number]]:
-    """Return P and B of minus the controller behind the plant, without the states that its output does not read."""
+def _sum(polynomial: Sequence[_Number], powers: Sequence[acb]) -> acb:
+    return sum((x.value * powers[k] for k, x in enumerate(polynomial)), acb(0))
+
+
+def _list_parts(a: Any, b: Any, c: Any, f: Any, g: Any, h: Any, j: Any, count: int) -> list[_Part]:
+    """Return all parts of minus the controller behind the plant, without the states that its outputs do not read."""
     zero = _Number(arb(0), [arb(0)] * count)
-    n, m = len(a), len(f)
+    n, m, controls = len(a), len(f), len(j)
     matrix = [[*a[i], *([zero] * m)] for i in range(n)]
     matrix += [[*(_dot(g[i], [row[k] for row in c], zero) for k in range(n)), *f[i]] for i in range(m)]
-    column = [*b, *([[zero]] * m)]
-    row = [*(_dot(j[0], [line[k] for line in c], zero) for k in range(n)), *(h[0] if m else [])]
-    needed, pending = set[int](), [k for k, x in enumerate(row) if not x.value.is_zero()]
+    columns = [[row] if controls == 1 else [[x] for x in row] for row in b] + [[[zero]] * controls] * m
+    outputs = [
+        [*(_dot(j[i], [line[k] for line in c], zero) for k in range(n)), *(h[i] if m else [])] for i in range(controls)
+    ]
+    needed, pending = set[int](), [k for row in outputs for k, x in enumerate(row) if not x.value.is_zero()]
     while pending:
         k = pending.pop()
         if k not in needed:
@@ -523,10 +548,24 @@ def _polynomials(
     keep = sorted(needed)
     unit = _Number(arb(1), zero.slopes)
     inner = [[_entry(matrix[i][k].negative(), *([unit] if i == k else [])) for k in keep] for i in keep]
-    # [[sI - A, b], [c, 0]] has the determinant -c adj(sI - A) b; the open loop is minus the controller.
-    border = [[*line, _entry(*column[i])] for line, i in zip(inner, keep, strict=True)]
-    border.append([*(_entry(row[k]) for k in keep), _entry(zero)])
-    return tuple(_read_polynomial(_determinant(x, count), len(keep) + 1, count) for x in (inner, border))  # pyright: ignore
+    # [[sI - A, q B], [c, I]] has the determinant P det(I - c (sI - A)^-1 q B); the open loop is minus the controller.
+    # q is s^far: a factor s^far in the determinant is one factor q.
+    far = len(keep) + 2 * controls + 1
+    parts = []
+    for size in range(controls + 1):
+        for rows in combinations(range(controls), size):
+            for inputs in combinations(range(controls), size):
+                whole = [
+                    [*line, *(_entry(*[zero] * far, *columns[i][k]) for k in inputs)]
+                    for line, i in zip(inner, keep, strict=True)
+                ]
+                for i in rows:
+                    corner = (_entry(unit if i == k else zero) for k in inputs)
+                    whole.append([*(_entry(outputs[i][k]) for k in keep), *corner])
+                numbers = _read_polynomial(_determinant(whole, count), (size + 1) * far, count)
+                turned = [numbers[d * far : d * far + len(keep) + 1] for d in range(size + 1)]
+                parts.append(_Part(rows, inputs, turned))
+    return parts
 
 
 class _Polynomial(NamedTuple):

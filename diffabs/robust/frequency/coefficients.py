@@ -14,6 +14,7 @@ poles lie, they do not cancel. The plant is then sampled exactly under a held in
 An interval is NaN where a step fails; the prover then halves the box.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeAlias
@@ -51,14 +52,64 @@ class Coefficients(NamedTuple):
     """The polynomials of an opened loop, for each box of parameters.
 
     Attributes:
-        poles: a_0 to a_n; the last is `ONE`.
-        zeros: b_0 to b_n; the last is None but for the rest of a delay of a sampled loop.
-        delay: Delay in front of both [s]; of a sampled loop whole periods.
+        minors: P det L[J, I] for each pair of `list_minors`, without the delay. The first is P, a_0 to a_n, with `ONE`
+            as a_n. Of one control the second is B, b_0 to b_n; b_n is None but for the rest of a delay of a sampled
+            loop.
+        delay: Delay in front of all controls [s]; of a sampled loop whole periods.
     """
 
-    poles: Polynomial
-    zeros: Polynomial
+    minors: list[Polynomial]
     delay: Jet
+
+    @property
+    def poles(self) -> Polynomial:
+        """P."""
+        return self.minors[0]
+
+
+Pair: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
+
+
+class MinorSum(NamedTuple):
+    """P det (I + L)[J, I] as a sum of minors.
+
+    Attributes:
+        pair: J and I.
+        terms: Number of the minor, its sign, and its power of e^(-s tau).
+    """
+
+    pair: Pair
+    terms: tuple[tuple[int, int, int], ...]
+
+
+def list_minors(controls: int) -> list[Pair]:
+    """Return the pairs (J, I) of equally many rows and columns of L, the smallest first."""
+    return [
+        (rows, columns)
+        for size in range(controls + 1)
+        for rows in itertools.combinations(range(controls), size)
+        for columns in itertools.combinations(range(controls), size)
+    ]
+
+
+def list_forms(controls: int) -> list[MinorSum]:
+    """Return P det (I + L)[J, I] for all pairs, the whole matrix first and P last.
+
+    A column in which the entry of I stands in place of that of L is left out, with its row.
+    """
+    pairs = list_minors(controls)
+    forms = []
+    for rows, columns in reversed(pairs):
+        terms = []
+        common = [i for i in rows if i in columns]
+        for left_out in itertools.chain.from_iterable(
+            itertools.combinations(common, size) for size in reversed(range(len(common) + 1))
+        ):
+            places = sum(rows.index(i) + columns.index(i) for i in left_out)
+            lines, inputs = (tuple(i for i in side if i not in left_out) for side in (rows, columns))
+            terms.append((pairs.index((lines, inputs)), -1 if places % 2 else 1, len(lines)))
+        forms.append(MinorSum((rows, columns), tuple(terms)))
+    return forms
 
 
 class Polynomials:
@@ -82,16 +133,20 @@ class Polynomials:
         self.rest = _Evaluation(e, e.rest)
         self.rows = [*range(len(e.rest))]
         if e.spare:
-            self._leave_row_out([Enclosure(np.full(1, x)) for x in middle])
+            self._leave_rows_out([Enclosure(np.full(1, x)) for x in middle])
 
-    def _leave_row_out(self, middle: list[Enclosure]) -> None:
-        """Leave out the row of the rest that follows from the others."""
+    def _leave_rows_out(self, middle: list[Enclosure]) -> None:
+        """Leave out the rows of the rest that follow from the others."""
         e, n = self.equations, len(self.rows)
         unknown = [np.full(1, x) for x in e.guess]
         jacobian = self._residual(middle, [Enclosure(x) for x in unknown])[1].middle()[0]
         for axis in (1, 0):
             jacobian = jacobian / np.maximum(np.abs(jacobian).max(axis, keepdims=True), 1e-300)
-        choices = [[i for i in self.rows if i != row] for row in range(n - e.spare, n)]
+        dropped = itertools.combinations(range(n - e.spare, n), n - len(e.unknown))
+        choices = [[i for i in self.rows if i not in rows] for rows in dropped]
+        if not np.isfinite(jacobian).all():  # a kink: no choice encloses the rest
+            self.rows = choices[0]
+            return
         self.rows = max(choices, key=lambda rows: np.linalg.svd(jacobian[rows], compute_uv=False).min(initial=np.inf))
 
     def over(self, low: np.ndarray, high: np.ndarray, *, slopes: bool = True) -> Coefficients:
@@ -135,7 +190,7 @@ class Polynomials:
                     _hold_input(plant, period, rest, count),
                     Jet(period.times(float(self.whole + self.broken))),
                 )
-            return Coefficients(*_polynomials(plant, controller), delay)
+            return Coefficients(_polynomials(plant, controller), delay)
 
     def _residual(
         self, box: list[Enclosure], unknown: list[Enclosure], slopes: bool = True
@@ -510,30 +565,35 @@ def _product(x: Entry, y: Entry) -> Entry:
 # Polynomials.
 
 
-def _polynomials(plant: list[Entries], controller: list[Entries]) -> tuple[Polynomial, Polynomial]:
-    """Return P and B of the open loop: minus the controller behind the plant, without unobserved states.
+def _polynomials(plant: list[Entries], controller: list[Entries]) -> list[Polynomial]:
+    """Return the minors of the open loop: minus the controller behind the plant, without unobserved states.
 
-    The inputs of the plant's B are u, s u, ...
+    The inputs of the plant's B are those of all controls. Of a sampled loop behind the rest of a delay they are u, s u.
     """
     (a, b, c), (f, g, h, j) = plant, controller
-    n, m = len(a), len(f)
+    n, m, controls = len(a), len(f), len(j)
     whole = [[*row, *([None] * m)] for row in a]
     whole += [[*_times([g[i]], c)[0], *f[i]] if n else [*f[i]] for i in range(m)]
-    into: list[Polynomial] = [*b, *([None] for _ in range(m))]
-    out = [None if x is None else -x for x in (*(_times(j, c)[0]), *(h[0] if m else []))]
-    observed = {i for i, x in enumerate(out) if x is not None}
+    into: list[list[Polynomial]] = [[row] if controls == 1 else [[x] for x in row] for row in b]
+    nothing: Polynomial = [None]
+    into += [[nothing] * controls for _ in range(m)]
+    out = [[*row, *(h[i] if m else [])] for i, row in enumerate(_times(j, c))]
+    observed = {i for row in out for i, x in enumerate(row) if x is not None}
     while more := {i for k in observed for i, x in enumerate(whole[k]) if x is not None} - observed:
         observed |= more
     keep = sorted(observed)
+    size = len(keep) + 1
     matrix = [
         [[None if whole[i][k] is None else -_require(whole[i][k]), *([ONE] if i == k else [])] for k in keep]
         for i in keep
     ]
-    bordered = [[*row, into[i]] for row, i in zip(matrix, keep, strict=True)]
-    bordered.append([*([None if out[k] is None else -_require(out[k])] for k in keep), [None]])
-    poles, zeros = _determinant(matrix), _determinant(bordered)
-    size = len(keep) + 1
-    return [*poles, *([None] * (size - len(poles)))], [*zeros, *([None] * (size - len(zeros)))]
+    minors = []
+    for rows, columns in list_minors(controls):
+        bordered = [[*row, *(into[i][k] for k in columns)] for row, i in zip(matrix, keep, strict=True)]
+        bordered += [[*([out[i][k]] for k in keep), *([None] for _ in columns)] for i in rows]
+        minor = _determinant(bordered)
+        minors.append([*minor, *([None] * (size - len(minor)))])
+    return minors
 
 
 def _require(x: Entry) -> Jet:

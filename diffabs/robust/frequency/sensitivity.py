@@ -4,6 +4,14 @@ With L = B/P e^(-s tau) and N = P + B e^(-s tau), the closed loop's denominators
 
     |S| <= M   <=>   f = |N|^2 - |P|^2/M^2 >= 0:   products, cos and sin; no division, no pole on the axis
 
+**Several controls.** L is a matrix and N = P det(I + L). |S| is the largest singular value of S = (I + L)^-1, and
+
+    f = |N|^2 det(I - S^H S/M^2) = sum over J, I of (-1/M^2)^(m - k) |P det (I + L)[J, I]|^2,   k rows J and columns I
+
+by the formulas of Cauchy and Binet and of Jacobi. P det (I + L)[J, I] is a polynomial in s and e^(-s tau). The
+eigenvalues of I - S^H S/M^2 are positive at high frequencies, and none becomes 0 on the way as f > 0: so |S| < M. One
+that is negative, f < 0, refutes the claim.
+
 **A cell** is a range of frequencies and a box of parameters. The mean value theorem bounds f from below there: its
 value at the middle, minus each derivative's greatest size over the cell times half of that side. A cell that is not
 proved is halved along the side that costs bound. A middle with f < 0 refutes the claim.
@@ -31,7 +39,15 @@ import numpy as np
 
 from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE
 from diffabs.loop.closed_loop import Loop
-from diffabs.robust.frequency.coefficients import ONE, Coefficients, Entry, Polynomials
+from diffabs.robust.frequency.coefficients import (
+    ONE,
+    Coefficients,
+    Entry,
+    MinorSum,
+    Polynomials,
+    list_forms,
+    list_minors,
+)
 from diffabs.robust.frequency.intervals import Enclosure, cosine, enclose_number, sine
 from diffabs.robust.frequency.opened import NO_ENTRY, OpenedEquations, derive_opened
 from diffabs.robust.reach.cover import check_box
@@ -137,7 +153,7 @@ def prove_sensitivity(
     """Return what can be proved of the greatest sensitivity of a loop over a box and all frequencies.
 
     Args:
-        loop: Loop with one control, in continuous time or with a `Sampled` controller, with exact delays.
+        loop: Loop in continuous time or with a `Sampled` controller, with exact delays. A sampled loop has one control.
         over: Range (low, high) of each parameter of the box, by path, in SI units. The ends are exact decimals.
         bound: Bound to prove of |1/(1 + L)|, above 1. Infinity proves stability only.
         added: The bound has to hold for every added delay from 0 to `added` [s].
@@ -213,6 +229,8 @@ class _Proof:
         self.equations, self.claim, self.until, self.progress = equations, claim, until, progress
         self.box = np.array([outer_ends(*ends) for ends in over.values()]).reshape(-1, 2)
         self.inner = list(over.values())
+        self.controls = len(equations.controller[3])
+        self.forms = list_forms(self.controls)
         self.middle = [0.5 * (low + high) for low, high in over.values()]
         self.tried = self.cells = 0
         self.worst: Place | None = None
@@ -241,11 +259,14 @@ class _Proof:
     def polynomials(self, whole: int, broken: bool) -> Polynomials:
         return Polynomials(self.equations, self.middle, whole, broken=broken)
 
+    def respond(self, coefficients: Coefficients, w: Enclosure, index: np.ndarray) -> "_Response":
+        return _respond(coefficients, self.forms, w, self.equations.period, index)
+
     def check_stable(self, params: Sequence[float], added: float, part: DelayRange) -> None:
         """Count the unstable poles at a point; raise _Refuted for any, and _Open if that is undecided."""
         point = np.array([[*params, added]])
         coefficients = self.polynomials(*part[1:]).over(point, point, slopes=False)
-        numbers = [x.value for x in (*coefficients.poles, *coefficients.zeros) if x is not None]
+        numbers = [x.value for minor in coefficients.minors for x in minor if x is not None]
         if not all(np.isfinite(x.low + x.high).all() for x in numbers):
             raise _Open(f"the point of rest is not enclosed where {self.name_params(params, added)}")
         period = self.equations.period
@@ -254,7 +275,7 @@ class _Proof:
         done: list[tuple[float, float]] = []
         while cells:
             low, high = np.array(cells).T
-            response = _respond(coefficients, Enclosure(low, high), period, np.zeros(len(low), int))
+            response = self.respond(coefficients, Enclosure(low, high), np.zeros(len(low), int))
             clear = np.zeros(len(low), bool)
             for x in response.closed:
                 clear |= False if x is None else (x.low > 0) | (x.high < 0)
@@ -264,9 +285,7 @@ class _Proof:
                 raise _Open("the stability at the middle of the box is not decided: a pole is on the stability limit")
             cells = [half for a, b in halved for half in ((a, 0.5 * (a + b)), (0.5 * (a + b), b))]
         edges = np.array(sorted({x for cell in done for x in cell}))
-        closed = _middles(
-            _respond(coefficients, Enclosure(edges), period, np.zeros(len(edges), int)).closed, len(edges)
-        )
+        closed = _middles(self.respond(coefficients, Enclosure(edges), np.zeros(len(edges), int)).closed, len(edges))
         turned = float(np.angle(closed[1:] * closed[:-1].conj()).sum())
         n = len(coefficients.poles) - 1
         if period is None:  # N is (jw)^n times a number whose distance from 1 is below 1, above `top`
@@ -300,20 +319,28 @@ class _Proof:
 
     def is_small(self, coefficients: Coefficients, top: float) -> np.ndarray:
         """Return whether |L| < 1 - 1/M, for each box, at all frequencies w >= top."""
-        n = len(coefficients.poles) - 1
-        sums = []
-        for polynomial in (coefficients.poles[:-1], coefficients.zeros):
+        n, unit = len(coefficients.poles) - 1, Enclosure(np.float64(1.0))
+
+        def bound(polynomial: Sequence[Entry]) -> Enclosure:
+            """Return a bound of |polynomial|/w^n."""
             total = Enclosure(np.zeros(1))
             for k, x in enumerate(polynomial):
                 if x is not None:
-                    falling = Enclosure(np.float64(1.0))
+                    falling = unit
                     for _ in range(n - k):
                         falling = falling * Enclosure(np.float64(top)).inverse()
                     total = total + Enclosure(x.value.size()) * falling
-            sums.append(total)
-        unit = Enclosure(np.float64(1.0))
-        reserve = (unit - self.share) * (unit - sums[0]) - sums[1]
-        return reserve.low > 0
+            return total
+
+        below, gain, change = bound(coefficients.poles[:-1]), Enclosure(np.zeros(1)), Enclosure(np.zeros(1))
+        for (rows, columns), minor in zip(list_minors(self.controls), coefficients.minors, strict=True):
+            if rows:
+                size = bound(minor)
+                gain = gain + size if len(rows) == 1 else gain
+                change = change + size if rows == columns else change
+        reserve = (unit - self.share) * (unit - below) - gain
+        # Behind `top`, N has to be (jw)^n times a number whose distance from 1 is below 1; of one control it is.
+        return np.logical_and(reserve.low > 0, (unit - below - change).low > 0)
 
     def cover(self, delays: tuple[float, float], whole: int, broken: bool) -> DelayPiece:
         """Return the cells that prove the claim for a range of added delays."""
@@ -389,19 +416,19 @@ class _Proof:
         whole = polynomials.over(boxes[:, :count], boxes[:, count:])
         centre = np.clip(0.5 * (boxes[:, :count] + boxes[:, count:]), boxes[:, :count], boxes[:, count:])
         point = polynomials.over(centre, centre, slopes=False)
-        period, square = self.equations.period, self.share.square()
+        square = self.share.square()
         with np.errstate(all="ignore"):
-            at = _respond(point, Enclosure(middle[:, 0]), period, index)
-            f = _square_modulus(at.closed) - _square_modulus(at.open) * square
+            at = self.respond(point, Enclosure(middle[:, 0]), index)
+            f = square_form(at, self.forms, square)
             self.note_worst(at, f, middle)
-            over = _respond(whole, Enclosure(low[:, 0], high[:, 0]), period, index)
-            slopes = _slopes(whole, over, square, index, period, count)
+            over = self.respond(whole, Enclosure(low[:, 0], high[:, 0]), index)
+            slopes = _slopes(whole, over, self.forms, square, index, count)
             radius = Enclosure(np.nextafter(np.maximum(high - middle, middle - low), np.inf))
             costs = np.stack([(Enclosure(x.size()) * radius[:, k]).high for k, x in enumerate(slopes)], 1)
             reserve = Enclosure(f.low)
             for k in range(count + 1):
                 reserve = reserve - Enclosure(costs[:, k])
-            direct = _square_modulus(over.closed) - _square_modulus(over.open) * square
+            direct = square_form(over, self.forms, square)
             proved = np.logical_or(reserve.low > 0, direct.low > 0)
         failed = np.logical_not(np.isfinite(costs).all(1))  # no polynomial: the parameters, in turn
         shares = (high - low)[:, 1:] / np.maximum((self.box_widths())[None], 1e-300)
@@ -414,8 +441,12 @@ class _Proof:
     def note_worst(self, at: "_Response", f: Enclosure, middle: np.ndarray) -> None:
         """Keep the greatest sensitivity at the middles of cells, and refute the claim where f < 0."""
         with np.errstate(all="ignore"):
-            ratio = np.sqrt(_square_modulus(at.open).middle() / _square_modulus(at.closed).middle())
-            at_least = np.sqrt(_square_modulus(at.open).low / _square_modulus(at.closed).high) * (1 - 1e-14)
+            if self.controls == 1:
+                ratio = np.sqrt(_square_modulus(at.open).middle() / _square_modulus(at.closed).middle())
+                at_least = np.sqrt(_square_modulus(at.open).low / _square_modulus(at.closed).high) * (1 - 1e-14)
+            else:  # f < 0 says that the bound is exceeded; by how much is computed in floats
+                ratio = _singular_values(at, self.forms, self.controls, len(middle))
+                at_least = np.maximum(ratio * (1 - 1e-9), self.claim.bound)
         i = int(np.argmax(np.where(np.isfinite(ratio), ratio, -1.0)))
         place = Place(float(middle[i, 0]), tuple(map(float, middle[i, 1:-1])), float(middle[i, -1]), float(ratio[i]))
         if self.worst is None or place.sensitivity > self.worst.sensitivity:
@@ -544,70 +575,142 @@ class _Response(NamedTuple):
     """Numbers of each cell.
 
     Attributes:
-        open: P.
-        zeros: B.
-        turn: e^(-jw tau); None without a delay.
-        closed: N = P + B e^(-jw tau).
+        minors: Values of the coefficients' minors.
+        turns: e^(-jw tau d) for d = 0, 1, ...; None for 1.
+        forms: P det (I + L)[J, I]; the first is N, the last P.
+        w: Frequencies.
         powers: s^k.
         rates: Derivative of s^k along w.
     """
 
-    open: Complex
-    zeros: Complex
-    turn: Complex | None
-    closed: Complex
+    minors: list[Complex]
+    turns: list[Complex | None]
+    forms: list[Complex]
+    w: Enclosure
     powers: list[Complex]
     rates: list[Complex]
 
+    @property
+    def closed(self) -> Complex:
+        """N."""
+        return self.forms[0]
 
-def _respond(coefficients: Coefficients, w: Enclosure, period: float | None, index: np.ndarray) -> _Response:
+    @property
+    def open(self) -> Complex:
+        """P."""
+        return self.forms[-1]
+
+
+def square_form(at: _Response, forms: Sequence[MinorSum], square: Enclosure) -> Enclosure:
+    """Return f = |N|^2 det(I - S^H S/M^2), the sum of (-1/M^2)^(m - k) |P det (I + L)[J, I]|^2 of all k by k minors."""
+    total, controls = _square_modulus(at.forms[0]), len(forms[0].pair[0])
+    for form, value in zip(forms[1:], at.forms[1:], strict=True):
+        missing = controls - len(form.pair[0])
+        size = _weigh(_square_modulus(value), square, missing)
+        total = total - size if missing % 2 else total + size
+    return total
+
+
+def _weigh(x: Enclosure, square: Enclosure, power: int) -> Enclosure:
+    for _ in range(power):
+        x = x * square
+    return x
+
+
+def _respond(
+    coefficients: Coefficients, forms: Sequence[MinorSum], w: Enclosure, period: float | None, index: np.ndarray
+) -> _Response:
     """Return the response of the boxes `index` at frequencies."""
     powers, rates = _powers(w, period, len(coefficients.poles))
-    below = _combine(coefficients.poles, powers, index)
-    above = _combine(coefficients.zeros, powers, index)
+    minors = [_combine(minor, powers, index) for minor in coefficients.minors]
     delay = _pick(coefficients.delay.value, index)
-    turn = None
+    turns: list[Complex | None] = [None] * (len(forms[0].pair[0]) + 1)
     if np.any(delay.low) or np.any(delay.high):
         angle = w * delay
-        turn = (cosine(angle), -sine(angle))
-    closed = _add(below, above if turn is None else _multiply(above, turn))
-    return _Response(below, above, turn, closed, powers, rates)
+        for d in range(1, len(turns)):
+            turned = angle if d == 1 else angle.times(float(d))
+            turns[d] = (cosine(turned), -sine(turned))
+    values = [_sum_terms(form, [_turn(minors[i], turns[d]) for i, _, d in form.terms]) for form in forms]
+    return _Response(minors, turns, values, w, powers, rates)
+
+
+def _turn(x: Complex, turn: Complex | None) -> Complex:
+    return x if turn is None else _multiply(x, turn)
+
+
+def _sum_terms(form: MinorSum, values: Sequence[Complex]) -> Complex:
+    total: Complex = (None, None)
+    for (_, sign, _), value in zip(form.terms, values, strict=True):
+        total = _add(total, value if sign > 0 else _rotate(value, 2))
+    return total
+
+
+def _singular_values(at: _Response, forms: Sequence[MinorSum], controls: int, count: int) -> np.ndarray:
+    """Return the largest singular value of S at the middles of cells, in floats; S is adj(I + L) P/N."""
+    everything = range(controls)
+    values = {form.pair: _middles(value, count) for form, value in zip(forms, at.forms, strict=True)}
+    s = np.empty((count, controls, controls), complex)
+    for i in everything:
+        for j in everything:
+            pair = tuple(k for k in everything if k != j), tuple(k for k in everything if k != i)
+            s[:, i, j] = (-1) ** (i + j) * values[pair] / values[forms[0].pair]
+    finite = np.isfinite(s).all((1, 2))
+    s[~finite] = 0.0
+    return np.where(finite, np.linalg.svd(s, compute_uv=False)[:, 0], np.nan)
 
 
 def _slopes(
-    coefficients: Coefficients, at: _Response, square: Enclosure, index: np.ndarray, period: float | None, count: int
+    coefficients: Coefficients,
+    at: _Response,
+    forms: Sequence[MinorSum],
+    square: Enclosure,
+    index: np.ndarray,
+    count: int,
 ) -> list[Enclosure]:
     """Return the derivatives of f along the frequency, the parameters and the added delay."""
-    zero = Enclosure(np.zeros(len(index)))
     delay = _pick(coefficients.delay.value, index)
-    rate = _combine(coefficients.zeros, at.rates, index)
-    if at.turn is not None:  # (B e^(-jw tau))' = (B' - j tau B) e^(-jw tau)
-        rate = _multiply(_add(rate, _scale(_turn_right(at.zeros), delay)), at.turn)
-    open_rate = _combine(coefficients.poles, at.rates, index)
-    along = _inner(at.closed, _add(open_rate, rate)) - _inner(at.open, open_rate) * square
-    slopes = [along.times(2.0)]
-    parts: list[Enclosure] = [zero] * count
-    for k, power in enumerate(at.powers):
-        by_pole, by_zero = None, None
-        for x, is_pole in ((coefficients.poles[k], True), (coefficients.zeros[k], False)):
+    controls = len(forms[0].pair[0])
+
+    def along(values: Callable[[int, int], Complex | None]) -> Enclosure:
+        """Return half of the derivative of f, from those of the minors times their turns."""
+        total = Enclosure(np.zeros(len(index)))
+        for form, value in zip(forms, at.forms, strict=True):
+            moved: Complex = (None, None)
+            for i, sign, d in form.terms:
+                if (move := values(i, d)) is not None:
+                    moved = _add(moved, move if sign > 0 else _rotate(move, 2))
+            if moved == (None, None):
+                continue
+            missing = controls - len(form.pair[0])
+            part = _weigh(_inner(value, moved), square, missing)
+            total = total - part if missing % 2 else total + part
+        return total
+
+    rates = [_combine(minor, at.rates, index) for minor in coefficients.minors]
+
+    def by_frequency(i: int, d: int) -> Complex:  # (B e^(-jw tau d))' = (B' - j tau d B) e^(-jw tau d)
+        if at.turns[d] is None:
+            return rates[i]
+        return _turn(_add(rates[i], _scale(_turn_right(at.minors[i]), delay.times(float(d)))), at.turns[d])
+
+    parts = [along(by_frequency), *(Enclosure(np.zeros(len(index))) for _ in range(count))]
+    for i, minor in enumerate(coefficients.minors):
+        for x, power in zip(minor, at.powers, strict=False):
             if x is None or not x.slopes:
                 continue
-            if is_pole and by_pole is None:
-                by_pole = _inner(at.closed, power) - _inner(at.open, power) * square
-            if not is_pole and by_zero is None:
-                by_zero = _inner(at.closed, power if at.turn is None else _multiply(power, at.turn))
-            factor = by_pole if is_pole else by_zero
-            assert factor is not None
+            factor = along(lambda k, d, i=i, power=power: _turn(power, at.turns[d]) if k == i else None)
             for j, slope in x.slopes.items():
-                parts[j] = parts[j] + factor * _pick(slope, index)
+                parts[j + 1] = parts[j + 1] + factor * _pick(slope, index)
     if coefficients.delay.slopes:
-        w = at.powers[1][1] if period is None else None
-        assert w is not None
-        turned = at.zeros if at.turn is None else _multiply(at.zeros, at.turn)
-        factor = _inner(at.closed, _scale(_turn_right(turned), w))
+        turned = [_scale(_turn_right(x), at.w) for x in at.minors]
+        factor = along(lambda i, d: _turn(_scale(turned[i], _exact(d)), at.turns[d]) if d else None)
         for j, slope in coefficients.delay.slopes.items():
-            parts[j] = parts[j] + factor * _pick(slope, index)
-    return [*slopes, *(x.times(2.0) for x in parts)]
+            parts[j + 1] = parts[j + 1] + factor * _pick(slope, index)
+    return [x.times(2.0) for x in parts]
+
+
+def _exact(x: float) -> Enclosure:
+    return Enclosure(np.float64(x))
 
 
 def _powers(w: Enclosure, period: float | None, count: int) -> tuple[list[Complex], list[Complex]]:

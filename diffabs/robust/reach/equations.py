@@ -17,7 +17,7 @@ and only with the slip as a state does an enclosure keep that. `check_slip_chart
 import dataclasses
 import math
 import random
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -392,7 +392,7 @@ class Derivation:
             grid = [self.graph.input(x, UpdateLevel.STEP, (GRID, i)) for i, x in enumerate((np.float64, np.int64))]
             ticks = self.lower(lambda loop, z, c: flat(after(loop, state_of(z[:-1]), z[-1], *c)), nodes, grid)
             for name, root in zip(names[:-1], ticks, strict=True):
-                if not _nodes_below(root).isdisjoint(grid):
+                if not nodes_below(root).isdisjoint(grid):
                     raise NoRule(f"{name} depends on the number of its tick or on the step of the integration grid")
             ticked = [self.convert(x, chart_states) for x in ticks] + [self.make("state", (), n)]
             for i in (slip, speed, travelled) if self.charted else ():
@@ -468,7 +468,8 @@ class Derivation:
 
         tangents = {x.id: rate for x, rate in zip(inputs, rates, strict=True)}
         substitutes = {x.id: state for x, state in zip(inputs, plant_nodes, strict=True)}
-        dv, dw = (self.substitute(_tangent(graph, root, tangents), substitutes) for root in self.lower(speeds, inputs))
+        roots = [graph_tangent(graph, root, tangents) for root in self.lower(speeds, inputs)]
+        dv, dw = (self.substitute(root, substitutes) for root in roots)
         loss = graph.op("sub", graph.op("mul", graph.op("sub", graph.const(1.0), chart.slip), dv), dw)
         return [graph.op("div", loss, chart.speed), dv, jax.tree.unflatten(structure, rates).distance]
 
@@ -626,8 +627,11 @@ class Derivation:
             case "rint":
                 return make("round", (args[0],))
             case "sqrt":
-                negative, no_value = make("lt", (args[0], number(0.0))), make("inv", (number(0.0),))
-                return make("select", (negative, self.power(args[0], number(0.5), 0.5), no_value))
+                return self.root(args[0], 0.5)
+            case "pow" if _is_finite(node.args[1]) and float(node.args[1].attr) % 1:
+                exponent = float(node.args[1].attr)
+                value = self.root(args[0], abs(exponent))
+                return value if exponent > 0 else make("inv", (value,))
             case "exp" | "log" | "sin" | "cos" | "atan":
                 return self.function(node.op, args[0])
             case "tan":
@@ -641,6 +645,11 @@ class Derivation:
             case "expm1":
                 return make("sub", (self.function("exp", args[0]), number(1.0)))
         raise NoRule(f"{node.op}: the proof has no sound rule for this operation")
+
+    def root(self, u: int, exponent: float) -> int:
+        """Return u^e, e > 0 and no integer, which has no value for u < 0."""
+        negative, no_value = self.make("lt", (u, self.number(0.0))), self.make("inv", (self.number(0.0),))
+        return self.make("select", (negative, self.power(u, self.number(exponent), exponent), no_value))
 
     def logic(self, name: str, args: list[int]) -> int:
         """Return a logical operation; one that a known truth decides is that truth."""
@@ -772,7 +781,7 @@ def _is_traced(path: object, leaf: np.ndarray) -> bool:
     return np.asarray(leaf).dtype.kind == "f" and not (words[0] in BLOCKS and words[-1] in ("period", "delay"))
 
 
-def _tangent(graph: Graph, root: Node, tangents: dict[int, Node]) -> Node:
+def graph_tangent(graph: Graph, root: Node, tangents: dict[int, Node]) -> Node:
     """Return the derivative of a node along the given derivatives of other nodes, by their number."""
     zero, op, derivatives = graph.const(0.0), graph.op, dict(tangents)
 
@@ -801,7 +810,7 @@ def _tangent(graph: Graph, root: Node, tangents: dict[int, Node]) -> Node:
     return of(root)
 
 
-def _nodes_below(root: Node) -> set[Node]:
+def nodes_below(root: Node) -> set[Node]:
     """Return a node, its operands, their operands, and so on."""
     nodes, pending = {root}, [root]
     while pending:
@@ -845,20 +854,35 @@ def check_slip_chart(loop: Loop, over: Iterable[str] = ()) -> None:
     constants = [constant_array(graph, np.asarray(x)) for x in closed.consts]
     roots = [x.item() for x in lower_jaxpr(graph, closed.jaxpr, constants, [scalar_array(x) for x in inputs])]
     nominal = {path: Fraction(float(value) or 1.0) for path, _, value in parameters(loop) if path in paths}
-    draw = random.SystemRandom()  # a plant cannot know the points
-    ends = (-CHART_DECADES, CHART_DECADES)
-    points = [(speed, slip, [x] * len(paths)) for speed in (SLOWEST, FASTEST) for slip in CHART_SLIPS for x in ends]
-    for _ in range(CHART_TRIALS):
-        speed = min(max(Fraction(10 ** draw.uniform(-1.7, 2.3)).limit_denominator(10**9), SLOWEST), FASTEST)
-        points.append((speed, Fraction(draw.randint(0, 10**6 - 1), 10**6), [draw.uniform(*ends) for _ in paths]))
-    for speed, slip, decades in points:
-        values = [nominal[path] * Fraction(10.0**x) for path, x in zip(paths, decades, strict=True)]
-        distance = Fraction(draw.randint(0, 10**7), 1000)
-        if _exact_values(roots, [speed, slip, distance, *values]) != [slip, speed, (1 - slip) * speed]:
+    for speed, (slip,), distance, values in chart_points(1, [nominal[path] for path in paths]):
+        numbers = [speed, slip, distance, *values]
+        if exact_values(roots, {(STATE, i): x for i, x in enumerate(numbers)}) != [slip, speed, (1 - slip) * speed]:
             raise NoRule(f"plant {type(loop.plant).__name__}: its slip is not 1 - w/v at {float(speed):.3g} m/s")
 
 
-def _exact_values(roots: list[Node], inputs: list[Fraction]) -> list[Any]:
+def chart_points(
+    slips: int, nominal: Sequence[Fraction]
+) -> Iterator[tuple[Fraction, list[Fraction], Fraction, list[Fraction]]]:
+    """Yield speed, slips, distance and parameters around nominal ones, at which a change of coordinates is checked."""
+    draw = random.SystemRandom()  # a plant cannot know the points
+    ends = (-CHART_DECADES, CHART_DECADES)
+    points = [
+        (speed, [slip] * slips, [x] * len(nominal))
+        for speed in (SLOWEST, FASTEST)
+        for slip in CHART_SLIPS
+        for x in ends
+    ]
+    for _ in range(CHART_TRIALS):
+        speed = min(max(Fraction(10 ** draw.uniform(-1.7, 2.3)).limit_denominator(10**9), SLOWEST), FASTEST)
+        drawn = [Fraction(draw.randint(0, 10**6 - 1), 10**6) for _ in range(slips)]
+        points.append((speed, drawn, [draw.uniform(*ends) for _ in nominal]))
+    for speed, drawn, decades in points:
+        values = [x * Fraction(10.0**decade) for x, decade in zip(nominal, decades, strict=True)]
+        yield speed, drawn, Fraction(draw.randint(0, 10**7), 1000), values
+
+
+def exact_values(roots: list[Node], inputs: Mapping[Any, Fraction]) -> list[Any]:
+    """Return the values of nodes in fractions, from those of the inputs by their place."""
     exact: dict[int, Any] = {}
 
     def value(node: Node) -> Any:
@@ -870,7 +894,7 @@ def _exact_values(roots: list[Node], inputs: list[Fraction]) -> list[Any]:
         if node.op == "const":
             return bool(node.attr) if node.dtype == bool else Fraction(float(node.attr))
         if node.op == "input":
-            return inputs[node.attr[1]]
+            return inputs[node.attr]
         x = [value(arg) for arg in node.args]
         match node.op:
             case "add":
