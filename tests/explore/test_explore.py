@@ -479,6 +479,15 @@ def test_a_refused_edit_is_withdrawn_with_later_edits(session, tmp_path):
     assert session.value("initial.speed") == pytest.approx(30 / 3.6)
 
 
+@killed_by("output.explore.stability", "    _refuse_several_controls(scenario)\n    here", "    here")
+@killed_by("output.explore.stability", "    _refuse_several_controls(scenario)\n    loop", "    loop")
+def test_a_loop_with_several_controls_says_why_it_has_no_curves():
+    tank = load("quadruple-tank")
+    for compute in (lambda: stability.linear_stability(tank, None), lambda: stability.loop_curves(tank, np.ones(1))):
+        with pytest.raises(ValueError, match="2 controls: its linear model compiles for too long"):
+            compute()
+
+
 @pytest.mark.slow
 def test_a_loop_without_a_linear_model_says_so():
     with pytest.raises(ValueError, match="no linear loop"):

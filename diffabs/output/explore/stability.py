@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from diffabs.core.channels import need_single_control
+from diffabs.core.channels import control_names
 from diffabs.core.pytree import replace
 from diffabs.core.types import PyTree
 from diffabs.linear.opened_loop import OpenLoop, open_loop
@@ -139,6 +139,7 @@ def linearise_box(scenario: Scenario, earlier: BoxLoops | None = None) -> BoxLoo
 
 def linear_stability(scenario: Scenario, box: BoxLoops | None) -> Stability:
     """Return poles, margins and curves of the linearised loop. Raises ValueError for a loop without a linear model."""
+    _refuse_several_controls(scenario)
     here = band(scenario.loop, {}, 0).systems[0]
     return Stability(
         here.loop.period,
@@ -151,12 +152,21 @@ def linear_stability(scenario: Scenario, box: BoxLoops | None) -> Stability:
     )
 
 
+def _refuse_several_controls(scenario: Scenario) -> None:
+    """Raise a ValueError for a loop with several controls, whose linear model compiles for 10 s to minutes."""
+    if names := control_names(scenario.loop.plant):
+        raise ValueError(
+            f"no poles and curves of a loop with {len(names)} controls: its linear model compiles for too long. "
+            "`diffabs margins` has its singular values"
+        )
+
+
 def loop_curves(scenario: Scenario, w: np.ndarray) -> LoopCurves:
     """Return L, |S| and its goal at frequencies w [rad/s], without the margins, which take longer.
 
     Raises ValueError for a loop without a linear model.
     """
-    need_single_control(scenario.loop.plant, "a curve over frequency")
+    _refuse_several_controls(scenario)
     loop = open_loop(scenario.loop)
     return _curves(scenario, loop, w, stable=is_stable(loop.transfer()))
 
