@@ -144,7 +144,7 @@ class FrequencyBounds:
             return jnp.eye(s.shape[-1]) - s
 
         def respond_to_noise(s: Array, w: Array) -> Array:
-            columns, controller = tracked_columns(loop), as_arrays(halves.controller)
+            columns, controller = tracked_columns(loop), as_arrays(halves.controller, 0)
             return s @ respond(controller._replace(B=controller.B[:, columns], D=controller.D[:, columns]), w)
 
         def divide_by_shape(s: Array, w: Array) -> Array:

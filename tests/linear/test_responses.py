@@ -14,7 +14,7 @@ from scipy.signal import cont2discrete
 from diffabs.core.compiling import SAME_RESULT_OPTIONS
 from diffabs.core.pytree import get, replace
 from diffabs.linear import Transfer, band, margins, multivariable_margins, open_loop
-from diffabs.linear.opened_loop import open_traced
+from diffabs.linear.opened_loop import OpenLoop, open_traced
 from diffabs.linear.responses import (
     complementary_peak,
     delay_margin,
@@ -28,6 +28,8 @@ from diffabs.linear.responses import (
     sensitivity_peak,
     structured_singular_value,
 )
+from diffabs.linear.responses.opening import join_halves
+from diffabs.linear.responses.response import as_arrays, respond
 from diffabs.linear.stability_margins import is_stable
 from diffabs.loop.batch import Batch
 from diffabs.scenario import load
@@ -189,6 +191,18 @@ def test_loops_of_scenarios(name):
     np.testing.assert_allclose(computed, [expected.sensitivity, expected.phase, expected.delay], rtol=1e-7)
     errors = [np.abs((along(h)[0] - along(-h)[0]) / (2 * h) / slopes - 1) for h in WIDTHS]
     assert np.max(np.min(errors, axis=0)) < 1e-6
+
+
+@killed_by("linear.responses.opening", "as_arrays(halves.controller, 0)", "as_arrays(halves.controller)")
+def test_a_controller_without_states():
+    """L = k/(s^2 + s + 1) by a state feedback (k, 0); the controller alone is a gain."""
+    plant = Transfer(np.array([[0.0, 1.0], [-1.0, -1.0]]), np.array([[0.0], [1.0]]), np.eye(2), np.zeros((2, 1)))
+    gain, s = np.array([[-3.0, 0.0]]), 1j * np.array([0.3, 3.0])
+    halves = OpenLoop(plant, Transfer(np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((1, 0)), gain), 0.0)
+    a, b, c = (np.asarray(matrix) for matrix in join_halves(halves)[:3])
+    computed = c @ np.linalg.solve(s[:, None, None] * np.eye(2) - a, b + 0j)
+    np.testing.assert_allclose(computed[:, 0, 0], 3 / (s**2 + s + 1), rtol=1e-12)
+    np.testing.assert_array_equal(respond(as_arrays(halves.controller, 0), jnp.asarray(s.imag)), [gain, gain])
 
 
 def test_singular_values_of_a_loop_with_two_channels():

@@ -56,7 +56,7 @@ def open_transfer(loop: Loop, target: Scalar | None = None) -> TracedSystem:
 
 def join_halves(halves: OpenLoop, more: Scalar = 0.0) -> TracedSystem:
     """Return L of the halves of an open loop with `more` delay [s]; whole periods stay a pure delay."""
-    plant, controller, period = as_arrays(halves.plant), as_arrays(halves.controller), halves.controller.period
+    plant, controller, period = as_arrays(halves.plant), as_arrays(halves.controller, 0), halves.controller.period
     delay = jnp.asarray(halves.delay + more, jnp.result_type(float))
     if period is not None:
         whole = jnp.floor(delay / period + WHOLE_PERIOD_TOLERANCE)

@@ -52,6 +52,8 @@ def compile_for_systems(function: Callable[..., Result]) -> Callable[[Transfer |
 
 def respond(system: TracedSystem, w: Array) -> Array:
     """Return the response (k, p, m) at frequencies w (k,) [rad/s]; not finite at a pole."""
+    if not len(system.A):
+        return system.D * _delay_factors(system, w)
     return (system.C @ _inverse(_subtract_matrix(system, w)) @ system.B + system.D) * _delay_factors(system, w)
 
 
@@ -177,14 +179,15 @@ def half_sampling_rate(system: TracedSystem) -> Scalar:
     return jnp.inf if system.period is None else jnp.pi / jnp.asarray(system.period)
 
 
-def as_arrays(system: Transfer | TracedSystem) -> TracedSystem:
+def as_arrays(system: Transfer | TracedSystem, least_order: int = 1) -> TracedSystem:
     """Return a system with JAX arrays. Raises ValueError if it is no system, or its matrices do not fit each other."""
     if not isinstance(system, Transfer | TracedSystem):
         raise ValueError(f"{type(system).__name__} is no Transfer: linear.from_control makes one of python-control's")
     n, (p, m) = (np.shape(system.A) or (0,))[0], np.shape(system.D) if np.ndim(system.D) == 2 else (0, 0)
     for name, shape in {"D": (p, m), "A": (n, n), "B": (n, m), "C": (p, n)}.items():
-        if np.shape(getattr(system, name)) != shape or 0 in shape:
-            needed = "A (n, n), B (n, m), C (p, n) and D (p, m) are needed, n, m and p at least 1"
+        if np.shape(getattr(system, name)) != shape or not (p and m and n >= least_order):
+            sizes = "n, m and p at least 1" if least_order else "m and p at least 1"
+            needed = f"A (n, n), B (n, m), C (p, n) and D (p, m) are needed, {sizes}"
             raise ValueError(f"{name} has the shape {np.shape(getattr(system, name))}: {needed}")
     dtype = jnp.result_type(float)
     a, b, c, d = (jnp.asarray(matrix, dtype) for matrix in system[:4])
