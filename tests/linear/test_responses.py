@@ -301,6 +301,20 @@ def test_structured_singular_value(real):
     assert min(abs(d / slope - 1) for d in differences) < 1e-5
 
 
+@killed_by("linear.responses.structured", "(t * members - squares), -turns]", "(t * members - squares), turns]")
+def test_bounds_of_a_real_number_and_a_full_block():
+    """The upper bound is mu (Meinsma, Shrivastava and Fu, 1997): a search over the real number gives the block."""
+    draw, numbers = np.random.default_rng(5), np.geomspace(0.01, 30.0, 4001)
+    numbers, matrices = np.concatenate([-numbers, [0.0], numbers]), draw.normal(size=(40, 3, 3, 2)) @ [1, 1j]
+    scaled = matrices * np.array([1e4, 1.0, 1.0]) * np.array([1e-4, 1.0, 1.0])[:, None]  # D M D^-1 has the same mu
+    mu = compile_quickly(jax.vmap(lambda m: structured_singular_value(m, [1, 2], [True, False])))(scaled)
+    for m, lower, upper in zip(matrices, mu.lower, mu.upper, strict=True):
+        rest = m[1:, 1:] + (numbers / (1 - m[0, 0] * numbers))[:, None, None] * (m[1:, :1] @ m[:1, 1:])
+        exact = np.max(1 / np.maximum(np.abs(numbers), 1 / np.linalg.norm(rest, 2, axis=(1, 2))))
+        assert exact * (1 - 1e-9) < upper < 1.003 * exact
+        assert lower < (1 + 1e-9) * upper
+
+
 def lower_bounds(matrices, blocks, real):
     """The lower bounds of matrices (k, n, n)."""
     return np.asarray(compile_quickly(jax.vmap(lambda m: structured_singular_value(m, blocks, real).lower))(matrices))

@@ -8,8 +8,9 @@ diagonal, real and zero in complex blocks,
     mu^2 <= least t with t D - M* D M - j (G M - M* G) >= 0
 
 The matrix depends on D and G linearly, so for each t the analytic centre of all D and G is found by Newton's method.
-Then t moves towards the largest eigenvalue there (method of centres: S. Boyd and L. El Ghaoui, Linear Algebra Appl. 188
-(1993)). The inverse of the matrix at the last centre is the dual solution, which gives the derivative in M.
+They are a cone; a term of their size makes the centre finite. Then t moves towards the largest eigenvalue there (method
+of centres: S. Boyd and L. El Ghaoui, Linear Algebra Appl. 188 (1993)). The inverse of the matrix at the last centre is
+the dual solution, which gives the derivative in M.
 
 **Lower bound**: ascents over Delta, from several starts. Each step takes the Delta of norm 1 that makes the linearised
 eigenvalue of Delta M greatest while it stays real, as the fixed points of the power iteration of P. Young and J. Doyle
@@ -23,14 +24,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.types import AnyArray, Array, Scalar
 
+BALANCE_SWEEPS, LEAST_COUPLING = 20, 1e-20  # before both bounds; the square of a coupling, relative
 CENTRES, NEWTON_STEPS = 60, 6  # levels t, and Newton steps to the centre of each
+STEP_LENGTHS = 3  # of each Newton step, each twice the one before
+HESSIAN_SHIFT = 1e-13  # of a Hessian with a unit diagonal
+LEAST_SLACK = 0.7  # power of the machine precision: t over the largest eigenvalue in the end, relative
 FIRST_LEVEL = 1.5  # first t, over the largest eigenvalue without scalings
-LEVEL_SHARE = 0.05  # of the way from the largest eigenvalue at the centre to the old t that the new t keeps
+LEVEL_SHARE = 0.2  # of the way from the largest eigenvalue at the centre to the old t that the new t keeps
 LEAST_SQUARE = 1e-12  # mu^2 that counts as zero, relative to the largest singular value squared
 ASCENT_STEPS, ASCENT_STARTS = 30, 10  # of the lower bound
 ANGLE_HALVINGS, STEEPEST = 50, 1.5707  # of the angle whose tangent is the multiplier, and its end [rad]
@@ -53,9 +57,9 @@ class Mu(NamedTuple):
 
 
 class _Scalings(NamedTuple):
-    """ln d of each block but the last, whose d is 1, and g of each real block."""
+    """d of each block, and g of each real block."""
 
-    logs: Array
+    d: Array
     g: Array
 
 
@@ -63,10 +67,10 @@ def structured_singular_value(matrix: AnyArray, blocks: Sequence[int], real: Seq
     """Return bounds of mu of a square matrix for a structure of full blocks on the diagonal.
 
     The upper bound is differentiable; both work under `jit` and `vmap`. With real blocks mu may jump in the matrix, and
-    both bounds may be far from it.
+    both bounds may be far from it. The upper bound is mu for up to three complex blocks, or one of each kind.
 
     Args:
-        matrix: Matrix (n, n), real or complex.
+        matrix: Matrix (n, n), real or complex; with a NaN both bounds are NaN.
         blocks: Size of each block; their sum is n.
         real: Whether each block is a real number instead of a complex matrix; empty for none. A real block has size 1.
 
@@ -88,95 +92,115 @@ def structured_singular_value(matrix: AnyArray, blocks: Sequence[int], real: Seq
         >>> print(f"{mu.lower:.4f} <= mu <= {mu.upper:.4f}")
         3.0000 <= mu <= 3.0000
     """
+    matrix = jnp.asarray(matrix)
     sizes, is_real = np.array(blocks, int), np.array(real if len(real) else [False] * len(blocks), bool)
     if np.ndim(matrix) != 2 or np.shape(matrix) != (sizes.sum(),) * 2 or (sizes < 1).any():
         raise ValueError(f"blocks = {list(blocks)} do not fit a matrix of the shape {np.shape(matrix)}")
     if len(is_real) != len(sizes) or (is_real & (sizes > 1)).any():
         raise ValueError(f"real = {list(real)}: one truth value for each block is needed, and a real block has size 1")
-    matrix = jnp.asarray(matrix, jnp.result_type(matrix, 1j))
+    matrix = matrix.astype(jnp.result_type(matrix, 1j))
     return _bound_both(matrix, blocks=tuple(sizes.tolist()), real=tuple(is_real.tolist()))
 
 
 @compile_once(("blocks", "real"), SAME_RESULT_OPTIONS)
 def _bound_both(matrix: Array, *, blocks: tuple[int, ...], real: tuple[bool, ...]) -> Mu:
     sizes, is_real = np.array(blocks), np.array(real)
+    matrix = _balance(matrix, sizes)
     return Mu(_bound_above(matrix, sizes, is_real), _bound_below(matrix, sizes, is_real))
+
+
+def _balance(matrix: Array, sizes: np.ndarray) -> Array:
+    """Return D M D^-1, which has the same mu, with equal norms of the rows and columns of blocks (Osborne, 1960)."""
+    block_of, count = np.repeat(np.arange(len(sizes)), sizes), len(sizes)
+    sums = jax.ops.segment_sum(jnp.abs(jax.lax.stop_gradient(matrix)) ** 2, block_of, count)
+    squares = jax.ops.segment_sum(sums.T, block_of, count).T * (1 - np.eye(count))
+    squares = squares + LEAST_COUPLING * jnp.max(squares)  # else the scalings of a triangular matrix have no end
+
+    def even_out(step: Scalar, logs: Array) -> Array:
+        """Even out the row and the column of one block; `logs` are ln d."""
+        i = step % count
+        row = jnp.sum(squares[i] * jnp.exp(2 * (logs[i] - logs)))
+        column = jnp.sum(squares[:, i] * jnp.exp(2 * (logs - logs[i])))
+        even = (row > 0) & (column > 0)
+        return logs.at[i].add(jnp.where(even, 0.25 * jnp.log(jnp.where(even, column / row, 1.0)), 0.0))
+
+    logs = jax.lax.fori_loop(0, BALANCE_SWEEPS * count, even_out, jnp.zeros(count))[block_of]
+    return matrix * jnp.exp(logs[:, None] - logs)
 
 
 def _bound_above(matrix: Array, sizes: np.ndarray, is_real: np.ndarray) -> Scalar:
     """Return the upper bound with its derivative from the dual solution."""
     block_of = np.repeat(np.arange(len(sizes)), sizes)
-    real_places = np.flatnonzero(is_real[block_of])
-
-    def scalings(x: _Scalings) -> tuple[Array, Array]:
-        """Return the diagonals of D and G."""
-        d = jnp.exp(jnp.append(x.logs, 0.0))[block_of]
-        return d, jnp.zeros(len(matrix)).at[real_places].set(x.g)
+    members = np.array([np.diag(block_of == i) for i in range(len(sizes))], float)
+    reals = members[is_real]
+    scale = jnp.maximum(jnp.linalg.norm(jax.lax.stop_gradient(matrix), 2), jnp.finfo(matrix.real.dtype).tiny)
+    frozen = jax.lax.stop_gradient(matrix) / scale
+    squares = frozen.conj().T @ members @ frozen
+    turns = 1j * (reals @ frozen - frozen.conj().T @ reals)
 
     def shape(m: Array, x: _Scalings) -> Array:
         """Return M* D M + j (G M - M* G)."""
-        d, g = scalings(x)
-        product = g[:, None] * m
-        return m.conj().T @ (d[:, None] * m) + 1j * (product - product.conj().T)
+        product = (x.g @ reals.diagonal(axis1=1, axis2=2))[:, None] * m
+        return m.conj().T @ (x.d[block_of][:, None] * m) + 1j * (product - product.conj().T)
 
     def level(x: _Scalings) -> Array:
         """Return the least t for given scalings: the largest eigenvalue of D^-1/2 shape D^-1/2."""
-        root = jnp.sqrt(scalings(x)[0])
+        root = jnp.sqrt(x.d[block_of])
         return jnp.linalg.eigvalsh(shape(frozen, x) / (root[:, None] * root))[-1]
 
+    def slack(x: _Scalings, t: Array) -> Array:
+        return t * jnp.diag(x.d[block_of]) - shape(frozen, x)
+
     def barrier(x: _Scalings, t: Array) -> Array:
-        d = scalings(x)[0]
-        slack = jnp.diag(t * d) - shape(frozen, x)
-        # The determinant relative to that of D does not depend on the scale of D.
-        return -jnp.linalg.slogdet(slack)[1] + jnp.sum(jnp.log(d))
+        """Return -ln det slack - sum ln d + tr slack + sum d; infinite outside of the cone."""
+        rest = slack(x, t)
+        values = jnp.linalg.eigvalsh(rest)
+        inside = (values[0] > 0) & (jnp.min(x.d) > 0)
+        logs = jnp.sum(jnp.log(jnp.where(inside, values, 1.0))) + jnp.sum(jnp.log(jnp.where(inside, x.d, 1.0)))
+        return jnp.where(inside, jnp.trace(rest).real + jnp.sum(x.d) - logs, jnp.inf)
 
     def centre(x: _Scalings, t: Array) -> _Scalings:
-        if not x.logs.size + x.g.size:  # a single complex block has no scalings
-            return x
-
         def step(_: object, x: _Scalings) -> _Scalings:
-            flat, unravel = ravel_pytree(x)
+            slopes = jnp.concatenate([x.d[:, None, None] * (t * members - squares), -turns])  # in ln d and g
+            relative = jnp.linalg.inv(slack(x, t)) @ slopes
+            traces = jnp.trace(slopes - relative, axis1=1, axis2=2).real
+            gradient = traces + jnp.pad(x.d - 1.0, (0, len(x.g)))
+            curvature = jnp.pad(jnp.ones(len(x.d)), (0, len(x.g)))  # of -ln d
+            hessian = jnp.einsum("iab,jba->ij", relative, relative).real + jnp.diag(curvature)
+            unit = jnp.diagonal(hessian) ** -0.5
+            hessian = hessian * unit[:, None] * unit + HESSIAN_SHIFT * jnp.eye(len(unit))
+            move = -unit * jnp.linalg.solve(hessian, unit * gradient)
+            # A self-concordant barrier falls at 1/(1 + decrement), and stays inside.
+            decrement = jnp.sqrt(jnp.maximum(-gradient @ move, 0.0))
 
-            def value(z: Array) -> Array:
-                return barrier(unravel(z), t)
+            def step_by(length: Array) -> _Scalings:
+                return _Scalings(x.d * (1 + length * move[: len(x.d)]), x.g + length * move[len(x.d) :])
 
-            gradient, hessian = jax.grad(value)(flat), jax.hessian(value)(flat)
-            # The barrier is convex in D and G, not in ln d: the absolute eigenvalues keep the step a descent.
-            curvatures, axes = jnp.linalg.eigh(hessian)
-            move = -axes @ ((axes.T @ gradient) / jnp.maximum(jnp.abs(curvatures), 1e-9))
-            move = move / jnp.maximum(1.0, jnp.linalg.norm(move))
-            trials = flat + move * (0.5 ** jnp.arange(8.0))[:, None]
-            levels, barriers = jax.vmap(lambda z: (level(unravel(z)), value(z)))(trials)
-            worth = jnp.where(levels < t, barriers, jnp.inf)
-            best = jnp.argmin(worth)
-            return unravel(jnp.where(worth[best] < value(flat), trials[best], flat))
+            lengths = 2.0 ** jnp.arange(STEP_LENGTHS) / (1 + decrement)
+            worth = jax.vmap(lambda length: barrier(step_by(length), t))(lengths)
+            best = jnp.argmin(jnp.where(jnp.isnan(worth), jnp.inf, worth))
+            better = worth[best] < barrier(x, t)
+            return jax.tree.map(lambda new, old: jnp.where(better, new, old), step_by(lengths[best]), x)
 
         return jax.lax.fori_loop(0, NEWTON_STEPS, step, x)
-
-    frozen = jax.lax.stop_gradient(matrix)
-    start = _Scalings(jnp.zeros(len(sizes) - 1), jnp.zeros(len(real_places)))
-
-    least_slack = 16 * jnp.finfo(matrix.real.dtype).eps
 
     def lower(_: object, state: tuple[_Scalings, Array]) -> tuple[_Scalings, Array]:
         x, t = state
         x = centre(x, t)
-        bound = level(x)
+        bound = jnp.maximum(level(x), 0.1 * LEAST_SQUARE)
         # At t = bound the matrix is singular and has no dual solution.
-        return x, bound + jnp.maximum(LEVEL_SHARE * (t - bound), least_slack * jnp.abs(bound))
+        return x, bound + jnp.maximum(LEVEL_SHARE * (t - bound), jnp.finfo(t.dtype).eps ** LEAST_SLACK * bound)
 
-    first = jnp.maximum(level(start), 0.0)
-    scale = jnp.maximum(jnp.linalg.norm(frozen, 2) ** 2, 1e-30)
-    x, t = jax.lax.fori_loop(0, CENTRES, lower, (start, FIRST_LEVEL * first + 1e-3 * scale))
+    start = _Scalings(jnp.ones(len(sizes)), jnp.zeros(len(reals)))
+    x, t = jax.lax.fori_loop(0, CENTRES, lower, (start, FIRST_LEVEL * jnp.maximum(level(start), 0.0) + 1e-3))
     x = jax.lax.stop_gradient(centre(x, t))
-    d = scalings(x)[0]
-    dual = jnp.linalg.inv(jnp.diag(t * d) - shape(frozen, x))
-    weight = jax.lax.stop_gradient(dual / jnp.sum(jnp.diagonal(dual).real * d))
+    dual = jnp.linalg.inv(slack(x, t))
+    weight = jax.lax.stop_gradient(dual / jnp.sum(jnp.diagonal(dual).real * x.d[block_of]))
     # The value is the level at the scalings; its derivative is that of the dual form, whose own value cancels.
-    form = jnp.sum(weight.T * shape(matrix, x)).real
+    form = jnp.sum(weight.T * shape(matrix / scale, x)).real
     square = jax.lax.stop_gradient(level(x) - form) + form
-    vanishes = square <= LEAST_SQUARE * scale
-    return jnp.where(vanishes, 0.0, jnp.sqrt(jnp.where(vanishes, 1.0, square)))
+    vanishes = square <= LEAST_SQUARE
+    return jnp.where(vanishes, 0.0, scale * jnp.sqrt(jnp.where(vanishes, 1.0, square)))
 
 
 class _Perturbation(NamedTuple):
@@ -285,4 +309,5 @@ def _bound_below(matrix: Array, sizes: np.ndarray, is_real: np.ndarray) -> Scala
 
     starts = jax.vmap(bound)(jax.random.split(jax.random.key(0), ASCENT_STARTS))
     greatest = jnp.max(starts)
-    return jnp.where(greatest**2 > LEAST_SQUARE * jnp.linalg.norm(matrix, 2) ** 2, greatest, 0.0)
+    square = LEAST_SQUARE * jnp.linalg.norm(matrix, 2) ** 2
+    return jnp.where(jnp.isnan(square), jnp.nan, jnp.where(greatest**2 > square, greatest, 0.0))
