@@ -32,9 +32,7 @@ def margins(
     ] = None,
     samples: Annotated[
         int,
-        typer.Option(
-            min=0, max=MOST_SAMPLES, help="Number of systems inside the ranges of [design.over], added to the corners."
-        ),
+        typer.Option(min=0, max=MOST_SAMPLES, help="Number of systems inside the ranges, added to the corners."),
     ] = 32,
     changes: console.Changes = None,
     plot: Annotated[
@@ -56,27 +54,28 @@ def margins(
     ] = False,
     over: Annotated[
         list[str] | None,
-        typer.Option("--over", metavar="PATH=LOW:HIGH", help="Range of --bounds; default: those of [design.over]."),
+        typer.Option("--over", metavar="PATH=LOW:HIGH", help="Range of a parameter; default: [design.over]."),
     ] = None,
     as_json: console.Json = False,
 ) -> None:
     """Compute stability margins of the linearised loop.
 
-    It shows gain, phase, delay and modulus margin of the scenario, and the worst over [design.over]. A plant with
-    several controls has them for each channel, with the others closed, and the least singular value of I + L. With
-    --bounds: the greatest |S| and |T| found in a box, and bounds for constant and for varying parameters."""
+    It shows gain, phase, delay and modulus margin of the scenario, and the worst over --over or [design.over]. A plant
+    with several controls has them for each channel, with the others closed, and the least singular value of I + L. With
+    --bounds: the greatest |S| and |T| found in these ranges, and bounds for constant and for varying parameters."""
     with console.end_on_errors():
         targets.check_picture(plot)
         with targets.new_target_file(plot, "--plot") as picture:
             setup = console.load_scenario(scenario, changes, integrated=False)
             values, target = _read_places(setup, at or ())
-            box = _read_box(setup, over or (), bounds, values, target)
-            if picture or proof or setup.design.over:
-                option = "margins --plot" if picture else "margins --proof" if proof else "margins over [design.over]"
+            ranges = {side.path: side.ends for side in read_sides(over, setup)} if over else None
+            box = _bounded_box(setup, ranges, values, target) if bounds else {}
+            ranged = "margins over [design.over]" if setup.design.over else over and not bounds and "margins --over"
+            if option := "margins --plot" if picture else "margins --proof" if proof else ranged:
                 console.refuse_several_controls(setup, option)
             try:
                 margin_results = console.run_with_progress(
-                    lambda: examine_margins(setup, values, target, samples), f"linearising {setup.name}"
+                    lambda: examine_margins(setup, values, target, samples, ranges), f"linearising {setup.name}"
                 )
             except ScenarioError:
                 raise
@@ -98,20 +97,17 @@ def margins(
         _judge(setup, margin_results)
 
 
-def _read_box(
-    setup: Scenario, over: Sequence[str], bounds: bool, values: dict[str, float], target: float | None
+def _bounded_box(
+    setup: Scenario, ranges: dict[str, tuple[float, float]] | None, values: dict[str, float], target: float | None
 ) -> dict[str, tuple[float, float]]:
-    """Return the ranges of --bounds by path, in SI."""
-    if over and not bounds:
-        console.fail("--over goes with --bounds; other ranges are those of [design.over]")
-    if not bounds:
-        return {}
+    """Return the ranges of --bounds by path, in SI, without those of fixed values."""
     if target is not None:
         console.fail("--at target does not go with --bounds: set the reference of the loop")
-    ranges = {side.path: side.ends for side in read_sides(over, setup)} if over else setup.design.ranges(setup.loop)
+    ranges = setup.design.ranges(setup.loop) if ranges is None else ranges
     box = {path: ends for path, ends in ranges.items() if path not in values}
     if not box:
-        console.fail("--bounds needs ranges: --over PATH=LOW:HIGH, or [design.over]")
+        fixed = f"; --at fixes {', '.join(ranges)}" if ranges else ""
+        console.fail(f"--bounds needs ranges: --over PATH=LOW:HIGH, or [design.over]{fixed}")
     return box
 
 

@@ -6,6 +6,7 @@ import math
 from rich.table import Table
 
 from diffabs.cli import console, show, tables
+from diffabs.cli.show_proofs import describe_box
 from diffabs.core.types import JsonObject
 from diffabs.linear.stability_margins import Margins
 from diffabs.scenario.parameter_paths import parameters_of
@@ -74,7 +75,8 @@ def show_bounds(result: JsonObject, scenario: Scenario) -> None:
         shown += [format_bound(name, proved[name]) if name in proved else ""] if proved else []
         reached = "unstable" if peak["reached"] == "inf" else f"{peak['reached']:.5g}"
         table.add_row(symbol, reached, format_place(peak["values"], scenario), *shown)
-    tables.show_titled_table("Greatest |S| and |T| over the ranges, at all frequencies", table)
+    box = describe_box(bounds["over"], scenario)
+    tables.show_titled_table(f"Greatest |S| and |T| at all frequencies, {box}", table)
     first = bounds["sensitivity"]
     console.say(
         "constant parameters: the bound of mu; varying parameters: a common Lyapunov matrix, at any rate of change"

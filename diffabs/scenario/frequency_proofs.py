@@ -31,6 +31,7 @@ from diffabs.robust.frequency.sensitivity import (
 )
 from diffabs.robust.reach.cover import check_box
 from diffabs.robust.reach.verification import FileVerdict
+from diffabs.scenario.parameter_paths import parameters_of
 from diffabs.scenario.robustness import ScenarioMargins
 from diffabs.scenario.scenario import Scenario, dump, loads
 
@@ -189,8 +190,10 @@ def read_proved_margins(
         value = float(np.asarray(get(loop, name)))
         lowest, highest = (pick([value, *margins.over.get(name, ())]) for pick in (min, max))
         if not low <= lowest <= highest <= high:
-            where = f"{name} in [{low:g}, {high:g}]"
-            raise ValueError(f"it is about {where}, and the margins are of {lowest:g} to {highest:g}")
+            unit = parameters_of(loop)[name][0].unit
+            unit = "" if unit == "1" else f" {unit}"
+            where = f"{name} in [{low:g}, {high:g}]{unit}"
+            raise ValueError(f"it is about {where}, and the margins are of {lowest:g} to {highest:g}{unit}")
     if outside := sorted(set(margins.over) - set(file.over)):
         raise ValueError(f"it is about one value of {', '.join(outside)}, and the margins are of a range")
     claims = [claim for claim, _ in file.claims]

@@ -20,7 +20,7 @@ class ScenarioMargins(NamedTuple):
     Attributes:
         values: Fixed values by path of the loop, in SI.
         target: Setpoint; None for the loop's own.
-        over: Ranges (low, high) of the other parameters of [design.over], by path, in SI.
+        over: Ranges (low, high) of the parameters that have no fixed value, by path, in SI.
         nominal: The loop at the fixed values.
         band: The loops over the ranges; without systems if there are no ranges.
     """
@@ -72,7 +72,11 @@ class ScenarioChannelMargins(NamedTuple):
 
 
 def examine_margins(
-    scenario: Scenario, values: Mapping[str, float] | None = None, target: float | None = None, samples: int = 32
+    scenario: Scenario,
+    values: Mapping[str, float] | None = None,
+    target: float | None = None,
+    samples: int = 32,
+    over: Mapping[str, tuple[float, float]] | None = None,
 ) -> ScenarioMargins | ScenarioChannelMargins:
     """Return the margins of a scenario's loop, at its values and over the ranges of [design.over].
 
@@ -82,6 +86,7 @@ def examine_margins(
         values: Values by path of the loop, in SI, which replace the loop's own and their ranges.
         target: Setpoint, as in `linear.open_loop`.
         samples: Number of systems inside the ranges, added to the corners.
+        over: Ranges (low, high) by path of the loop, in SI; None for those of [design.over].
 
     Raises:
         ScenarioError: A loop with several controls has a `target`, which is one of several.
@@ -97,6 +102,7 @@ def examine_margins(
             need_single_control(loop.plant, "margins over [design.over]")
         opened = open_loop(loop, target)
         return ScenarioChannelMargins(values, opened, multivariable_margins(opened))
-    over = {path: ends for path, ends in scenario.design.ranges(scenario.loop).items() if path not in values}
+    ranges = scenario.design.ranges(scenario.loop) if over is None else over
+    over = {path: ends for path, ends in ranges.items() if path not in values}
     (nominal,) = band(loop, {}, 0, target).systems
     return ScenarioMargins(values, target, over, nominal, band(loop, over, samples, target) if over else Band((), 0))

@@ -391,8 +391,11 @@ def test_margins_refuse_a_proof_of_another_loop_or_box(tmp_path):
     own = ("slip-lmi", "--set", "design.over.plant.mass=5.3:6.2", "--set", "design.over.initial.speed=5:13.9")
     command("certify", *own, "--sensitivity", "2.6", "--out", tmp_path / "p.json")
     for more, message in {
-        ("--set", "plant.mass=5"): "plant.mass in [5.3, 6.2], and the margins are of 5 to 6.2",
-        ("--set", "design.over.plant.mass=5.3:6.3"): "plant.mass in [5.3, 6.2], and the margins are of 5.3 to 6.3",
+        ("--set", "plant.mass=5"): "plant.mass in [5.3, 6.2] kg, and the margins are of 5 to 6.2 kg",
+        (
+            "--set",
+            "design.over.plant.mass=5.3:6.3",
+        ): "plant.mass in [5.3, 6.2] kg, and the margins are of 5.3 to 6.3 kg",
         ("--set", "design.over.road.w4=0.4:0.41"): "one value of plant.road.w4, and the margins are of a range",
         ("--at", "target=0.15"): "about another loop",
         ("--set", "actuator.type=lag"): "about another loop",
