@@ -70,9 +70,14 @@ def margins(
             values, target = _read_places(setup, at or ())
             ranges = {side.path: side.ends for side in read_sides(over, setup)} if over else None
             box = _bounded_box(setup, ranges, values, target) if bounds else {}
-            ranged = "margins over [design.over]" if setup.design.over else over and not bounds and "margins --over"
-            if option := "margins --plot" if picture else "margins --proof" if proof else ranged:
-                console.refuse_several_controls(setup, option)
+            uses = {
+                "--plot": picture,
+                "--proof": proof,
+                "over [design.over]": setup.design.over,
+                "--over without --bounds": over and not bounds,
+            }
+            for option in (option for option, use in uses.items() if use):
+                console.refuse_several_controls(setup, f"margins {option}")
             try:
                 margin_results = console.run_with_progress(
                     lambda: examine_margins(setup, values, target, samples, ranges), f"linearising {setup.name}"

@@ -90,7 +90,7 @@ REFUSALS = [
         2,
         ["parameter of the linear model, but not of this loop: remove it from [design.over]"],
     ),
-    ("margins quadruple-tank --over plant.share_1=0.6:0.7", 2, ["margins --over"]),
+    ("margins quadruple-tank --over plant.share_1=0.6:0.7", 2, ["margins --over without --bounds"]),
     ("margins slip-lmi --bounds --over plant.mass=5:6 --at plant.mass=5", 2, ["--at fixes plant.mass"]),
     ("margins slip-lmi --bounds --at target=0.2 --over plant.mass=5:6", 2, ["--at target does not go with --bounds"]),
     ("margins quadruple-tank --bounds", 2, ["--bounds needs ranges: --over PATH=LOW:HIGH, or [design.over]"]),

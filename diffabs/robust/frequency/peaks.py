@@ -53,7 +53,7 @@ class PeakBounds(NamedTuple):
         at: Frequency of its peak [rad/s].
         constant: Bound for constant parameters at all frequencies; infinite without one, NaN where the solver's answer
             does not pass its check.
-        constant_at: Frequency at which a single frequency has the greatest bound [rad/s].
+        constant_at: Frequency whose own bound, for it alone, is the greatest [rad/s].
         varying: Bound for parameters that vary arbitrarily fast, likewise.
         no_common: Whether it is proved that no common Lyapunov matrix exists, so `varying` is infinite.
         ranges: Number of frequency ranges of `constant`, each with its own multiplier.
@@ -106,7 +106,7 @@ def bound_peaks(
         ModuleNotFoundError: cvxpy is not installed.
 
     See also:
-        `frequency.prove_sensitivity`: A proof about the box itself, of a loop with one control.
+        `frequency.prove_sensitivity`: A proof about the box itself, with exact delays.
         `linear.band`: Margins at samples of a box.
         `linear.responses.structured_singular_value`: Bounds of mu of one matrix.
 
@@ -150,9 +150,9 @@ def bound_peaks(
         )
     systems = closed.unpack(hull.A)
     states = Polytope(A=systems.A, B=np.zeros((*systems.A.shape[:2], 1)), period=systems.period)
-    still = {claim.kind for claim in certify(np.zeros((1, states.order)), states).claims}
+    kinds = {claim.kind for claim in certify(np.zeros((1, states.order)), states).claims}
     times["hull"] = time.monotonic() - began
-    return {name: _bound(name, systems, hull, peak, over, still, times) for name, peak in peaks.items()}
+    return {name: _bound(name, systems, hull, peak, over, kinds, times) for name, peak in peaks.items()}
 
 
 class _Peak(NamedTuple):
@@ -170,12 +170,12 @@ def _without_bounds(over: Mapping[str, tuple[float, float]], peak: _Peak, times:
 
 def _bound(
     name: str, systems: VertexSystems, hull: Polytope, peak: _Peak, over: Mapping[str, tuple[float, float]],
-    refused: set[str], times: Mapping[str, float],
+    kinds: set[str], times: Mapping[str, float],
 ) -> PeakBounds:  # fmt: skip
-    """Return the bounds of one channel; `refused` are the kinds of claims about stability of the hull."""
+    """Return the bounds of one channel; `kinds` are those of what `certify` proves about the stability of the hull."""
     bounds = _without_bounds(over, peak, times)._replace(vertices=hull.vertices, coverage=hull.coverage)
-    no_common = bool(refused & {"infeasible", "unstable"})
-    if "unstable" in refused:
+    no_common = bool(kinds & {"infeasible", "unstable"})
+    if "unstable" in kinds:
         return bounds._replace(no_common=no_common)
     if name == "complementary":  # T = I - S
         systems = systems._replace(C=-systems.C, D=np.eye(systems.D.shape[1]) - systems.D)

@@ -70,7 +70,7 @@ class RangeBound(NamedTuple):
 
     Attributes:
         value: Bound; infinite if a frequency has none, NaN if the check after the solver fails.
-        at: Frequency of the greatest bound of a single frequency [rad/s].
+        at: Frequency whose own bound, for it alone, is the greatest [rad/s].
         ranges: Number of frequency ranges, each with its own F.
     """
 
