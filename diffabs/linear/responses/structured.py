@@ -30,9 +30,9 @@ from diffabs.core.types import AnyArray, Array, Scalar
 
 BALANCE_SWEEPS, LEAST_COUPLING = 20, 1e-20  # before both bounds; the square of a coupling, relative
 CENTRES, NEWTON_STEPS = 60, 6  # levels t, and Newton steps to the centre of each
-STEP_LENGTHS = 3  # of each Newton step, each twice the one before
+TRIED_LENGTHS = 3  # of each Newton step, each twice the one before
 HESSIAN_SHIFT = 1e-13  # of a Hessian with a unit diagonal
-LEAST_SLACK = 0.7  # power of the machine precision: t over the largest eigenvalue in the end, relative
+SLACK_POWER = 0.7  # power of the machine precision: t over the largest eigenvalue in the end, relative
 FIRST_LEVEL = 1.5  # first t, over the largest eigenvalue without scalings
 LEVEL_SHARE = 0.2  # of the way from the largest eigenvalue at the centre to the old t that the new t keeps
 LEAST_SQUARE = 1e-12  # mu^2 that counts as zero, relative to the largest singular value squared
@@ -176,7 +176,7 @@ def _bound_above(matrix: Array, sizes: np.ndarray, is_real: np.ndarray) -> Scala
             def step_by(length: Array) -> _Scalings:
                 return _Scalings(x.d * (1 + length * move[: len(x.d)]), x.g + length * move[len(x.d) :])
 
-            lengths = 2.0 ** jnp.arange(STEP_LENGTHS) / (1 + decrement)
+            lengths = 2.0 ** jnp.arange(TRIED_LENGTHS) / (1 + decrement)
             worth = jax.vmap(lambda length: barrier(step_by(length), t))(lengths)
             best = jnp.argmin(jnp.where(jnp.isnan(worth), jnp.inf, worth))
             better = worth[best] < barrier(x, t)
@@ -189,7 +189,7 @@ def _bound_above(matrix: Array, sizes: np.ndarray, is_real: np.ndarray) -> Scala
         x = centre(x, t)
         bound = jnp.maximum(level(x), 0.1 * LEAST_SQUARE)
         # At t = bound the matrix is singular and has no dual solution.
-        return x, bound + jnp.maximum(LEVEL_SHARE * (t - bound), jnp.finfo(t.dtype).eps ** LEAST_SLACK * bound)
+        return x, bound + jnp.maximum(LEVEL_SHARE * (t - bound), jnp.finfo(t.dtype).eps ** SLACK_POWER * bound)
 
     start = _Scalings(jnp.ones(len(sizes)), jnp.zeros(len(reals)))
     x, t = jax.lax.fori_loop(0, CENTRES, lower, (start, FIRST_LEVEL * jnp.maximum(level(start), 0.0) + 1e-3))
