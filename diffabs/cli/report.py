@@ -39,6 +39,8 @@ def report(
         if missing := [str(path) for path in sources if not path.exists()]:
             console.fail(f"{', '.join(missing)}: there is no such folder or file")
         check_target(target)
+        if not target.parent.is_dir():
+            console.fail(f"--out {target}: there is no folder {target.parent}")
         console.run_with_progress(lambda: write_report_file(sources, target), "writing the report")
         console.say(f"report: {target}")
 

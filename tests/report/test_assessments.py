@@ -14,7 +14,7 @@ from mutants import killed_by
 from diffabs.assess import Assessment, Clause, StopProgram
 from diffabs.host.documents import format_document
 from diffabs.host.values import plain_fields
-from diffabs.output.report import build_report, find_documents
+from diffabs.output.report import ReportError, build_report, find_documents
 from diffabs.scenario import load
 from diffabs.scenario.model import result_document
 
@@ -74,6 +74,8 @@ def test_the_command_takes_several_files(folder):
     assert "--out FILE.html is needed for several sources" in run("report", *files, status=2).stderr
     run("report", *files, "--out", folder / "both.html")
     assert "1 of 2 meet all" in Page((folder / "both.html").read_text()).text
+    nowhere = run("report", *files, "--out", folder / "no" / "x.html", status=2)
+    assert f"x.html: there is no folder {folder / 'no'}" in nowhere.stderr
     missing = run("report", files[0], folder / "none.json", "--out", folder / "x.html", status=2)
     assert "none.json: there is no such folder or file" in missing.stderr
     assert not (folder / "x.html").exists()
@@ -82,3 +84,18 @@ def test_the_command_takes_several_files(folder):
     files[1].write_text(json.dumps(content))
     broken = run("report", *files, "--out", folder / "x.html", status=2)
     assert "bad.json: cannot be read as a document of assess: KeyError 'stop'" in broken.stderr
+
+
+def test_a_comparison_that_cannot_be_made_names_the_files(folder):
+    content = json.loads((folder / "good.json").read_text())
+    content["model"]["title"] = 7
+    (folder / "good.json").write_text(json.dumps(content))
+    with pytest.raises(ReportError, match=r"bad\.json, .*good\.json: cannot be read as a document of assess: a value"):
+        build_report(find_documents(folder))
+
+
+def test_an_assessment_without_clauses_meets_none(folder):
+    content = json.loads((folder / "bad.json").read_text())
+    content["clauses"] = []
+    (folder / "bad.json").write_text(json.dumps(content))
+    assert "1 of 2 meet all: good car." in Page(build_report(find_documents(folder))).text

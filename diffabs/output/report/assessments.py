@@ -114,7 +114,8 @@ def _sentence(row: Table) -> str:
 
 
 def _meets_all(clauses: Iterable[Table]) -> bool:
-    return all(row["verdict"] == "met" for row in clauses if row["confirmed"])
+    met = [row["verdict"] == "met" for row in clauses if row["confirmed"]]
+    return bool(met) and all(met)
 
 
 def _notes(clauses: Iterable[Table]) -> Iterator[str]:

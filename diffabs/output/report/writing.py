@@ -1,5 +1,6 @@
 """Sections as one HTML file, which fetches nothing and contains no script."""
 
+import contextlib
 import importlib.resources
 import pathlib
 from collections.abc import Callable, Iterator, Sequence
@@ -79,20 +80,30 @@ def _compare(documents: Sequence[Document]) -> Iterator[Section]:
     for kind, compare in COMPARISON_BY_KIND.items():
         alike = [document for document in documents if document.kind == kind]
         if len(alike) > 1:
-            yield compare(alike)
+            with _naming_unreadable(*alike):
+                yield compare(alike)
 
 
 def _section(document: Document) -> Section:
-    try:
+    with _naming_unreadable(document):
         check_tables(document)
         return SECTION_BY_KIND[document.kind](document)
+
+
+@contextlib.contextmanager
+def _naming_unreadable(*documents: Document) -> Iterator[None]:
+    """Raise ReportError with the files of documents of one kind for an error in the `with` block."""
+    try:
+        yield
+        return
     except (DocumentError, ScenarioError) as error:
         message = str(error)
     except (TypeError, AttributeError):
         message = "a value in it is of the wrong type"
     except (KeyError, IndexError, ValueError, OSError) as error:
         message = " ".join(f"{type(error).__name__} {error}".split())
-    raise ReportError(f"{document.path}: cannot be read as a document of {document.kind}: {message}")
+    paths = ", ".join(str(document.path) for document in documents)
+    raise ReportError(f"{paths}: cannot be read as a document of {documents[0].kind}: {message}")
 
 
 def is_report(path: pathlib.Path) -> bool:
