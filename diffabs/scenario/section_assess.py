@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING
 
 from diffabs.core.types import JsonObject
 from diffabs.core.validity import find_problems
-from diffabs.host.values import ScenarioError, choice_reader, format_given, list_reader, plain_fields, read_table
+from diffabs.host.values import (
+    ScenarioError,
+    choice_reader,
+    list_reader,
+    plain_fields,
+    read_table,
+    wrong_kind_error,
+)
 from diffabs.loop.closed_loop import Loop
 
 ALL = "all"  # clauses that a plant can meet
@@ -52,8 +59,8 @@ def read_clauses(value: object, path: str, loop: Loop) -> tuple[str, ...]:
         raise ScenarioError(f"{path}: {error}") from None
     if value == ALL:
         return numbers
-    if isinstance(value, str):
-        raise ScenarioError(f'{path} = {format_given(value)}: "{ALL}" or a list of {", ".join(numbers)} is needed')
+    if not isinstance(value, list | tuple):
+        raise wrong_kind_error(path, value, f'"{ALL}" or a list of {", ".join(numbers)}')
     return list_reader(choice_reader(*numbers))(value, path)
 
 

@@ -227,7 +227,7 @@ def read_tune_section(table: object, loop: Loop, objectives: Mapping[str, Object
         free=lambda value, path: free_ranges(table_reader(read_as_given, "ranges")(value, path), loop, path),
         over=lambda value, path: _over(table_reader(read_as_given, "values")(value, path), loop, bool(samples)),
         objective=metric_reader(objectives, "weights of metrics"),
-        clauses=lambda value, path: read_clauses(value, path, loop) if value else (),
+        clauses=lambda value, path: read_clauses(value, path, loop) if value != [] else (),
         constraints=functools.partial(read_table, FrequencyConstraints),
         limits=metric_reader(
             objectives, "greatest values of metrics", lambda objective: unit_of(objective, loop.plant)

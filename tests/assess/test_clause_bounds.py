@@ -103,9 +103,13 @@ def test_all_clauses_are_those_of_the_plant():
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["half-car", "--set", "tune.clauses=every"], 'tune.clauses = "every": "all" or a list of 5.2.1, 5.3.1'),
+        (
+            ["half-car", "--set", "tune.clauses=every"],
+            'tune.clauses = "every" is text; "all" or a list of 5.2.1, 5.3.1',
+        ),
         (["half-car", "--set", "tune.clauses=['5.3.4']"], 'tune.clauses.0 = "5.3.4" is unknown; '),
-        (["half-car", "--set", "tune.clauses=3"], "tune.clauses = 3 is a number; a list is needed"),
+        (["half-car", "--set", "tune.clauses=3"], 'tune.clauses = 3 is a number; "all" or a list of 5.2.1'),
+        (["half-car", "--set", "tune.clauses=false"], 'tune.clauses = false is a boolean; "all" or a list of 5.2.1'),
         (["lab-rig", "--set", "tune.clauses=all"], "tune.clauses: LabRig has no tyres with roads; the plants half-car"),
     ],
 )
