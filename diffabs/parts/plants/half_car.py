@@ -223,10 +223,7 @@ class HalfCar(SlipProbes):
                 contact_rate(tyre, contact, Contact(slip, 0.0 * slip), state.speed)
                 for tyre, contact, slip in zip(self._tyres(), state.contacts, self._slips(state), strict=True)
             ),
-            self.pads.heat_rates(
-                state.temperatures,
-                (0.5 * torques.front_brake * state.front_spin, 0.5 * torques.rear_brake * state.rear_spin),
-            ),
+            self.pads.heat_rates(state.temperatures, self._disc_powers(state, torques)),
         )
 
     def least_scales(self) -> HalfCarState:
@@ -312,7 +309,7 @@ class HalfCar(SlipProbes):
         return self.front_tyre, self.rear_tyre
 
     def _disc_powers(self, state: HalfCarState, torques: AxleBrakes) -> tuple[Scalar, Scalar]:
-        """Return the power of each of the two brakes of both axles [W]."""
+        """Return the power that heats a disc of the front and of the rear axle [W], half of the power of the axle."""
         return 0.5 * torques.front_brake * state.front_spin, 0.5 * torques.rear_brake * state.rear_spin
 
     def _contact_slips(self, state: HalfCarState) -> Axles:
