@@ -43,7 +43,7 @@ class StopProgram:
         """Yield a line for an unknown name."""
         for field, names in (("adhesion", ADHESION_SOURCES), ("driven", DRIVEN)):
             if getattr(self, field) not in names:
-                yield f"{field} = {getattr(self, field)} is unknown; there is {', '.join(names)}"
+                yield f'{field} = "{getattr(self, field)}" is unknown; there is {", ".join(names)}'
 
     def rules(self) -> Iterator[Rule]:
         """Yield the rule that the good road has at least twice the adhesion of the slippery one."""

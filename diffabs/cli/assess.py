@@ -34,7 +34,10 @@ def assess_brakes(
         str | None, typer.Option(help="k of the utilised adhesion: road, or axles for one measured with one axle.")
     ] = None,
     cars: Annotated[
-        int, typer.Option(min=0, max=MOST_CARS, help="Assess this number of cars, drawn from [sweep.over].")
+        int,
+        typer.Option(
+            min=0, max=MOST_CARS, help="Assess this number of cars, drawn from [sweep.over]; 0: the scenario's own."
+        ),
     ] = 0,
     changes: console.Changes = None,
     as_json: console.Json = False,

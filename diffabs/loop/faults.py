@@ -34,7 +34,7 @@ class Fault(enum.IntEnum):
 FAULT_TEXTS = {
     Fault.NONE: "nothing",
     Fault.NUMBER: "a number is infinite or invalid, or no step meets its tolerance",
-    Fault.STEPS: "its steps are too many, as if a part switched in every step",
+    Fault.STEPS: "its steps are too many, as if a part switched in every step, or were far faster than the run",
     Fault.LANDING: "its last step misses the stop, or its start is beyond the stop",
     Fault.METRIC: "a metric is outside its physical range",
     Fault.AUDIT: "the plant's audit rejects it, as for a gain of energy",
