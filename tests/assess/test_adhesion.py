@@ -60,7 +60,7 @@ def test_the_car_has_the_mean_by_its_dynamic_loads(height):
 def test_an_unknown_measure_is_refused_in_a_line():
     for change, line in (("adhesion=axle", "road, axles"), ("driven=left", "front, rear, both")):
         field, name = change.split("=")
-        with pytest.raises(ValueError, match=f"assess.{field} = {name} is unknown; there is {line}"):
+        with pytest.raises(ValueError, match=f'assess.{field} = "{name}" is unknown; there is {line}'):
             load("half-car", [f"assess.{change}"])
 
 
