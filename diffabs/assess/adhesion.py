@@ -54,7 +54,10 @@ class AxleAdhesion(NamedTuple):
     wheelbase: Array
 
     def weigh(self, rate: Array, stops: list[RuleStop]) -> Array:
-        """Return k_M for the braking rates of stops with anti-lock brakes [1], both of shape (cars, stops)."""
+        """Return k_M for the braking rates of stops with anti-lock brakes [1], both of shape (cars, stops).
+
+        It is the mean of both axles, weighted by their loads at these rates; k_f where the rear axle does not count.
+        """
         loads = jnp.asarray([int(stop.laden) for stop in stops])
         roads = jnp.asarray([int(stop.left_side[0]) for stop in stops])
         front, rear = (k[:, loads, roads] for k in (self.front, self.rear))

@@ -136,6 +136,6 @@ def test_in_straight_motion_a_relaxed_car_is_the_relaxed_half_car():
 
 def test_a_relaxed_tyre_in_a_relaxed_tyre_is_refused():
     problems = list(find_problems(relaxed_car(RelaxedTyre(tyre=RelaxedTyre()))))
-    assert "front_tyre.tyre has a relaxation length of its own; enclose the tyre inside it" in " ".join(
+    assert "front_tyre.tyre has a relaxation length of its own; a tyre without one is needed" in " ".join(
         map(str, problems)
     )

@@ -315,7 +315,7 @@ class Car(SlipProbes):
     def least_scales(self) -> CarState:
         """Return the sizes below which errors are absolute: in straight motion y, yaw and steer angle are rounding."""
         contacts = tuple(map(least_contact, self._tyres()))
-        spins, discs = Wheels(1.0, 1.0, 1.0, 1.0), tuple(1.0 + 0.0 * heat for heat in self.pads.start(brakes=4))
+        spins, discs = Wheels(1.0, 1.0, 1.0, 1.0), tuple(1.0 + 0.0 * disc for disc in self.pads.start(brakes=4))
         return CarState(1.0, 1.0, 0.1, 1.0, 0.1, 0.1, 0.1, spins, contacts, discs)
 
     def project(self, state: CarState) -> CarState:
@@ -382,7 +382,8 @@ class Car(SlipProbes):
     def usual_parts(self) -> dict[str, PyTree]:
         """Return the default parts of a loop until standstill: a PID on the slip of each wheel, and a driver.
 
-        Both rear wheels get the lower one of their torques: on a split road they then carry the car to the side.
+        Both rear wheels get the lower one of their torques: on a split road a rear tyre then keeps friction for the
+        lateral force.
         """
         gains = PID(kp=1e4, ki=1.5e5, low=0.0, high=2000.0, antiwindup=Clamping())
         brakes = SelectLow(controller=PerChannel(dict.fromkeys(BRAKES, gains), BRAKES), groups=(tuple(BRAKES)[2:],))
@@ -506,6 +507,7 @@ class Car(SlipProbes):
         steers, rolling = _steers(state), self._rolling_force(state)
         x = y = 0.0 * state.longitudinal_velocity
         for _ in range(SOLVE_STEPS[all(tyre.proportional for tyre in self._tyres())]):
+            # Excesses f of the force X and g of the force Y, and their slopes by both.
             f, fx, fy, g, gx, gy = rolling - x, -1.0, 0.0, -y, 0.0, -1.0
             for force_of_load, (still, by_x, by_y), steer in zip(
                 forces_of_loads, self._load_terms(), steers, strict=True

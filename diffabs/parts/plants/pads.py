@@ -28,22 +28,22 @@ class ConstantPads:
     heated: ClassVar[bool] = False
 
     def start(self, brakes: int) -> tuple[Scalar, ...]:
-        """Return no temperatures."""
+        """Return nothing: there are no temperatures."""
         del brakes
         return ()
 
     def torques(self, temperatures: Sequence[Scalar], commands: Sequence[Scalar]) -> tuple[Scalar, ...]:
-        """Return the commands [N m]."""
+        """Return the brake torques [N m]: the commands, at every temperature."""
         del temperatures
         return tuple(commands)
 
     def commands(self, temperatures: Sequence[Scalar], torques: Sequence[Scalar]) -> tuple[Scalar, ...]:
-        """Return the torques [N m]."""
+        """Return the commands [N m]: the torques, at every temperature."""
         del temperatures
         return tuple(torques)
 
     def heat_rates(self, temperatures: Sequence[Scalar], powers: Sequence[Scalar]) -> tuple[Scalar, ...]:
-        """Return no rates."""
+        """Return nothing: there are no temperatures."""
         del temperatures, powers
         return ()
 
@@ -85,11 +85,13 @@ class FadingPads:
 
     def torques(self, temperatures: Sequence[Scalar], commands: Sequence[Scalar]) -> tuple[Scalar, ...]:
         """Return the brake torques [N m] that the commands [N m], of cold pads, make at these temperatures [K]."""
-        return tuple(self._share(heat) * command for heat, command in zip(temperatures, commands, strict=True))
+        shares = map(self._friction_left, temperatures)
+        return tuple(share * command for share, command in zip(shares, commands, strict=True))
 
     def commands(self, temperatures: Sequence[Scalar], torques: Sequence[Scalar]) -> tuple[Scalar, ...]:
-        """Return the commands [N m] of these torques [N m]."""
-        return tuple(quotient(torque, self._share(heat)) for heat, torque in zip(temperatures, torques, strict=True))
+        """Return the commands [N m] at which pads at these temperatures [K] make the torques [N m]."""
+        shares = map(self._friction_left, temperatures)
+        return tuple(quotient(torque, share) for share, torque in zip(shares, torques, strict=True))
 
     def heat_rates(self, temperatures: Sequence[Scalar], powers: Sequence[Scalar]) -> tuple[Scalar, ...]:
         """Return the rate of each temperature [K/s] under the power of its brake [W]; the first half is the front."""
@@ -100,5 +102,6 @@ class FadingPads:
             for temperature, power, capacity in zip(temperatures, powers, capacities, strict=True)
         )
 
-    def _share(self, temperature: Scalar) -> Scalar:
+    def _friction_left(self, temperature: Scalar) -> Scalar:
+        """Return the friction at a temperature [K] over that of cold pads."""
         return 1 - self.loss * jax.nn.sigmoid((temperature - self.middle) / self.spread)

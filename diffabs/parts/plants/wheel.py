@@ -58,17 +58,17 @@ def forward_speed(speed: Scalar) -> Scalar:
 
 
 def settled_contact(tyre: Tyre, slip: Scalar) -> PyTree:
-    """Return the contact of a tyre at rest at a slip [1]; () for a tyre whose force follows the slip at once."""
+    """Return the contact of a tyre that follows a constant slip [1]; () for one whose force follows at once."""
     return Contact(slip, 0.0 * slip) if hasattr(tyre, "relax") else ()
 
 
 def least_contact(tyre: Tyre) -> PyTree:
-    """Return slip and slip angle of a contact below which errors are absolute: both begin at 0."""
+    """Return slip and slip angle of a contact below which errors are absolute, as both begin at 0; () without one."""
     return Contact(LEAST_CONTACT, LEAST_CONTACT) if hasattr(tyre, "relax") else ()
 
 
 def contact_rate(tyre: Part, contact: PyTree, motion: Contact, speed: Scalar) -> PyTree:
-    """Return d(contact)/dt for slip and slip angle of the wheel and the vehicle's speed [m/s]."""
+    """Return d(contact)/dt at slip and slip angle of the wheel and the vehicle's speed [m/s]; () without a contact."""
     return tyre.relax(contact, *motion, speed) if contact else ()
 
 

@@ -178,9 +178,9 @@ class RelaxedTyre:
     """Relaxation length of the slip angle."""
 
     def problems(self) -> Iterator[str]:
-        """Yield a line for a relaxed tyre inside: the contact has one relaxation length."""
+        """Yield a line for a relaxed tyre inside this one: a contact has one relaxation length."""
         if hasattr(self.tyre, "relax"):
-            yield "tyre has a relaxation length of its own; enclose the tyre inside it"
+            yield "tyre has a relaxation length of its own; a tyre without one is needed, such as RoadTyre"
 
     @property
     def proportional(self) -> bool:
