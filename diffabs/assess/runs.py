@@ -22,7 +22,7 @@ from diffabs.loop.ensemble import run_batch
 from diffabs.loop.result import Run
 from diffabs.parts.objectives import InChannel, LockedTime, PeakOutput, RiseTime, TimeBetweenSpeeds
 from diffabs.parts.plants import GRAVITY
-from diffabs.parts.roads import Patches, RoadTyre
+from diffabs.parts.roads import Burckhardt, Patches, RoadTyre
 from diffabs.parts.stops import SpeedReached
 
 ONE_KMH = 1 / 3.6  # m/s
@@ -87,6 +87,7 @@ def run_stops(
     objectives: Mapping[str, Objective] | None = None,
     engine: str = "auto",
     per_stop: Population | None = None,
+    surfaces: tuple[Burckhardt, Burckhardt] | None = None,
 ) -> Run:
     """Return the runs of all stops, those of a car after another; also for a traced loop.
 
@@ -99,21 +100,24 @@ def run_stops(
         objectives: Further metrics by name.
         engine: Engine of the runs, as in `run_batch`.
         per_stop: Further parameters of each stop by path, shape (stops,).
+        surfaces: The good and the slippery surface, instead of those of the program.
 
     Returns:
         Runs with metrics of shape (cars * stops,).
     """
     population, columns, plant = population or {}, {}, loop.plant
     cars = next((len(column) for column in population.values()), 1)
-    curves = make_surface(program.high, slippery=False), make_surface(program.low, slippery=True)
+    curves = surfaces or (make_surface(program.high, slippery=False), make_surface(program.low, slippery=True))
     for name in tyre_fields(plant):
-        plant = replace(plant, {name: RoadTyre(road=Patches(roads=(curves[0], curves[0]), edges=np.array([NO_EDGE])))})
+        on_road = f"{name}.tyre" if hasattr(getattr(plant, name), "relax") else name  # a relaxation length stays
+        road = Patches(roads=(curves[0], curves[0]), edges=np.array([NO_EDGE]))
+        plant = replace(plant, {on_road: RoadTyre(road=road)})
         sides = [stop.right_side if "right" in name else stop.left_side for stop in stops]
         for place in (0, 1):
             for coefficient in CURVE:
                 values = _stack(getattr(curves[side[place]], coefficient) for side in sides)
-                columns[f"plant.{name}.road.roads.{place}.{coefficient}"] = jnp.tile(values, cars)
-        columns[f"plant.{name}.road.edges"] = jnp.tile(_stack(stop.edge for stop in stops), cars)[:, None]
+                columns[f"plant.{on_road}.road.roads.{place}.{coefficient}"] = jnp.tile(values, cars)
+        columns[f"plant.{on_road}.road.edges"] = jnp.tile(_stack(stop.edge for stop in stops), cars)[:, None]
     columns["initial.speed"] = jnp.tile(ONE_KMH * _stack(stop.speed for stop in stops), cars)
     columns |= {path: jnp.repeat(jnp.asarray(column), len(stops)) for path, column in population.items()}
     columns |= {path: jnp.tile(jnp.asarray(column), cars) for path, column in (per_stop or {}).items()}

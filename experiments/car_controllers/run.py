@@ -1,8 +1,9 @@
-"""Seven brake controllers of one car on the stops of a regulation: how far, how straight, and which wheels lock?
+"""Eight brake controllers of one car on the stops of a regulation and on four roads: how far, and how straight?
 
-The stops are those of `diffabs assess` (`assess.plan_stops`): good, slippery and split roads, jumps of the friction,
-unladen and laden. Every controller brakes the same cars, drawn at random in mass and height of the centre of gravity,
-with the same driver. Distances are relative to the shortest one that friction allows.
+The stops are those of `diffabs assess` (`assess.plan_stops`), and further ones on Burckhardt's dry and wet asphalt,
+snow and ice, and with a lane change. Every controller brakes the same cars, drawn at random in mass and height of the
+centre of gravity, unladen and laden, with the same driver. Distances are relative to the shortest one that friction
+allows.
 
     python experiments/car_controllers/run.py
 """
@@ -16,6 +17,10 @@ import numpy as np
 
 from diffabs import Adaptive, Loop, replace
 from diffabs.assess import RuleStop, StopProgram, clause_figures, plan_stops, run_stops
+from diffabs.assess.runs import NO_EDGE
+from diffabs.assess.surfaces import make_surface
+from diffabs.linear import SlipModel, lqr
+from diffabs.loop.result import Run
 from diffabs.output import plot
 from diffabs.papers import record
 from diffabs.parts.actuators import HydraulicBrake, PerControl
@@ -27,30 +32,39 @@ from diffabs.parts.controllers import (
     FourPhase,
     HoldCourse,
     PerChannel,
+    ProportionalFeedback,
     SelectLow,
     SlidingMode,
 )
-from diffabs.parts.objectives import PeakOutput, StopDistance
-from diffabs.parts.plants import GRAVITY
+from diffabs.parts.objectives import BrakeWork, InChannel, PeakOutput, StopDistance
+from diffabs.parts.plants import GRAVITY, QuarterCar
 from diffabs.parts.plants.car import BRAKES
 from diffabs.parts.references import ExtremumSeeking, PerTarget
+from diffabs.parts.roads import DRY_ASPHALT, ICE, SNOW, WET_ASPHALT, Burckhardt
 from diffabs.scenario import load
 from experiments._shared.numbers import store_numbers
 
 KMH, END = 1 / 3.6, 15.0  # m/s; km/h, where the stops end
 REAR = tuple(BRAKES)[2:]
+WORKS = {
+    f"work_{brake}": InChannel(objective=BrakeWork(), control=brake, output=slip) for brake, slip in BRAKES.items()
+}
 OBJECTIVES = {
     "distance": StopDistance(),
     "yaw": PeakOutput(output="yaw"),
     "lateral": PeakOutput(output="lateral_position"),
+    **WORKS,
 }
+ROADS = {"dry": (DRY_ASPHALT, 100.0), "wet": (WET_ASPHALT, 100.0), "snow": (SNOW, 50.0), "ice": (ICE, 50.0)}  # km/h
+LANE = 3.5  # m, to the left
+LANE_SPEEDS = {False: 80.0, True: 50.0}  # km/h, by whether the road is slippery
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Every number of the experiment."""
 
-    cars: int = 500
+    cars: int = 2_000
     seed: int = 68
     mass: tuple[float, float] = (1000.0, 1300.0)  # kg, unladen
     height: tuple[float, float] = (0.5, 0.65)  # m
@@ -72,6 +86,20 @@ def drive(controller: Any, low: bool, **parts: Any) -> Loop:
     return replace(base, {"controller": HoldCourse(controller=controller_of_brakes), **parts})
 
 
+def design_lq(config: Config) -> ProportionalFeedback:
+    """Return the LQ gain of a wheel at slip 0.1 and 100 km/h, in proportion to the speed as in the cure of [lmi].
+
+    The weights are the inverse squares of sizes: 1e-3 s of the integral, a slip of 0.02, 1,000 N m (Bryson's rule).
+    """
+    speed = 100 * KMH
+    car = load("car-straight").loop.plant
+    road = make_surface(config.program.high, slippery=False)
+    wheel = QuarterCar(mass=car.mass / 4, inertia=car.front_wheel_inertia, radius=car.radius, road=road)
+    A, B = SlipModel(plant=wheel, slip=0.1, speed=speed).matrices()
+    gain = lqr(A, B, np.diag([1e3**2, 50.0**2]), [[1e-3**2]]).gain[0]
+    return ProportionalFeedback(gain=gain, reference_speed=speed, low=0.0, high=2000.0, antiwindup=Clamping())
+
+
 def list_controllers(config: Config) -> dict[str, Callable[[], Loop]]:
     """Return the loops by the names of their controllers."""
     pid = PID(kp=1e4, ki=1.5e5, low=0.0, high=2000.0, antiwindup=Clamping())
@@ -86,6 +114,7 @@ def list_controllers(config: Config) -> dict[str, Callable[[], Loop]]:
         "PID of each wheel": lambda: drive(pid, low=False),
         "PID, select-low at the rear": lambda: drive(pid, low=True),
         "PID, extremum seeking": lambda: drive(pid, low=True, reference=seeking),
+        "LQ, gain by the speed": lambda: drive(design_lq(config), low=True),
         "sliding mode": lambda: drive(SlidingMode(gain=2000.0, boundary=0.05, low=0.0, high=2000.0), low=True),
         "four phases": lambda: drive(logic, low=False),
         "five phases, hydraulic": lambda: drive(FivePhase(), low=True, actuator=hydraulic),
@@ -105,13 +134,71 @@ def shortest(stop: RuleStop, program: StopProgram) -> float:
     return ((stop.speed * KMH) ** 2 - (END * KMH) ** 2) / (2 * GRAVITY * adhesion)
 
 
+def shortest_on(road: Burckhardt, speed: float) -> float:
+    """Return the shortest distance on a road whose friction depends on the speed, down to 15 km/h [m]."""
+    speeds = np.linspace(END * KMH, speed * KMH, 400)
+    greatest = np.asarray(road.friction(np.linspace(1e-3, 1.0, 2000)[:, None], speeds)).max(axis=0)
+    return float(np.trapezoid(speeds / (GRAVITY * greatest), speeds))
+
+
+def brake_on_roads(config: Config, loop: Loop, cars: dict[str, np.ndarray]) -> tuple[dict[str, float | None], int]:
+    """Return the excess over the shortest distance on each road, unladen and laden [%], and how many runs are lost."""
+    row, lost = {}, 0
+    for pair in (("dry", "snow"), ("wet", "ice")):
+        surfaces = tuple(ROADS[name][0] for name in pair)
+        stops = [
+            RuleStop("adhesion", ROADS[name][1], laden, (slippery,) * 2, (slippery,) * 2, NO_EDGE)
+            for slippery, name in zip((False, True), pair, strict=True)
+            for laden in (False, True)
+        ]
+        runs = run_stops(loop, solver_of(config), stops, config.program, cars, OBJECTIVES, surfaces=surfaces)
+        out = lost_runs(runs, stops)
+        distances = np.where(out, np.nan, np.asarray(runs.metrics["distance"]).reshape(out.shape))
+        for place, name in enumerate(pair):
+            nearest = shortest_on(*ROADS[name])
+            row[f"{name}, {ROADS[name][1]:g} km/h [% over least]"] = mean_of(
+                100 * (distances[:, 2 * place : 2 * place + 2] / nearest - 1)
+            )
+        lost += int(out.sum())
+    return row, lost
+
+
+def change_lanes(config: Config, loop: Loop, cars: dict[str, np.ndarray]) -> tuple[dict[str, float | None], int]:
+    """Return how far a driver who wants to reach the next lane gets while braking [m], and how many runs are lost."""
+    stops = [
+        RuleStop("adhesion", LANE_SPEEDS[slippery], laden, (slippery,) * 2, (slippery,) * 2, NO_EDGE)
+        for slippery in (False, True)
+        for laden in (False, True)
+    ]
+    lines = {"controller.line": np.full(len(stops), LANE)}
+    runs = run_stops(loop, solver_of(config), stops, config.program, cars, OBJECTIVES, per_stop=lines)
+    out = lost_runs(runs, stops)
+    lateral = np.where(out, np.nan, np.asarray(runs.metrics["lateral"]).reshape(out.shape))
+    names = {"lane change, good [m]": lateral[:, :2], "lane change, slippery [m]": lateral[:, 2:]}
+    return {name: mean_of(values) for name, values in names.items()}, int(out.sum())
+
+
+def solver_of(config: Config) -> Adaptive:
+    """Return the solver of all runs."""
+    return Adaptive(config.rtol, config.duration)
+
+
+def lost_runs(runs: Run, stops: list[RuleStop]) -> np.ndarray:
+    """Return whether each run of each car diverged or did not reach 15 km/h, shape (cars, stops)."""
+    return (np.asarray(runs.diverged) | ~np.asarray(runs.stopped)).reshape(-1, len(stops))
+
+
+def mean_of(values: np.ndarray) -> float | None:
+    """Return the mean of the runs that were not lost; None if all were."""
+    return float(np.nanmean(values)) if np.isfinite(values).any() else None
+
+
 def judge(config: Config, name: str, loop: Loop, cars: dict[str, np.ndarray]) -> dict[str, Any]:
     """Return the row of a controller."""
     program = config.program
     stops = plan_stops(loop.plant, program)
-    solver = Adaptive(config.rtol, config.duration)
-    runs = run_stops(loop, solver, stops, program, cars, OBJECTIVES)
-    lost = (np.asarray(runs.diverged) | ~np.asarray(runs.stopped)).reshape(-1, len(stops))
+    runs = run_stops(loop, solver_of(config), stops, program, cars, OBJECTIVES)
+    lost = lost_runs(runs, stops)
     metrics = {metric: np.asarray(values).reshape(lost.shape) for metric, values in runs.metrics.items()}
     locked = np.max([values for metric, values in metrics.items() if metric.startswith("locked_")], axis=0)
     met = np.all([_met(row, lost) for row in clause_figures(runs, stops, program) if row.confirmed], axis=0)
@@ -124,8 +211,7 @@ def judge(config: Config, name: str, loop: Loop, cars: dict[str, np.ndarray]) ->
         ]
 
     def mean(values: np.ndarray, at: list[int]) -> float | None:
-        finished = np.where(lost, np.nan, values)[:, at]
-        return float(np.nanmean(finished)) if np.isfinite(finished).any() else None
+        return mean_of(np.where(lost, np.nan, values)[:, at])
 
     def excess(at: list[int]) -> float | None:
         distances = np.array([shortest(stops[i], program) for i in at])
@@ -134,10 +220,14 @@ def judge(config: Config, name: str, loop: Loop, cars: dict[str, np.ndarray]) ->
         return mean(100 * whole, at)
 
     split = places("split")
+    on_roads, lost_on_roads = brake_on_roads(config, loop, cars)
+    lanes, lost_in_lanes = change_lanes(config, loop, cars)
+    work = 1e-3 * np.sum([metrics[name] for name in WORKS], axis=0)
     return {
         "controller": name,
         "good, 120 km/h [% over least]": excess(places("lock", False, program.fast)),
         "slippery, 55 km/h [% over least]": excess(places("adhesion", True)),
+        **on_roads,
         "locked, one surface [s]": mean(locked, places("lock") + places("adhesion")),
         "locked, jump down [s]": mean(locked, places("down")),
         "rise, jump up [s]": mean(np.minimum(metrics["rise_time"], 10.0), places("up")),
@@ -145,8 +235,10 @@ def judge(config: Config, name: str, loop: Loop, cars: dict[str, np.ndarray]) ->
         "split: yaw [rad]": mean(metrics["yaw"], split),
         "split: lateral [m]": mean(metrics["lateral"], split),
         "split: steering wheel [deg]": mean(np.degrees(program.steering_ratio * metrics["steer"]), split),
+        **lanes,
+        "brake work, good, 120 km/h [kJ]": mean(work, places("lock", False, program.fast)),
         "all clauses [% of cars]": float(100 * np.mean(met)),
-        "lost runs": int(lost.sum()),
+        "lost runs": int(lost.sum()) + lost_on_roads + lost_in_lanes,
     }
 
 
@@ -164,7 +256,7 @@ def figures(table: list[dict[str, Any]]) -> dict[str, Any]:
         "slippery, 55 km/h [% over least]": "stopping distance, slippery road [% over least]",
         "split: lateral [m]": "split road: lateral position [m]",
     }
-    figure, axes = plot.sheet(1, 3, title="One car, seven controllers", size=(3.6, 3.0), sharey=True)
+    figure, axes = plot.sheet(1, 3, title="One car, eight controllers", size=(3.6, 3.0), sharey=True)
     names = [row["controller"] for row in table]
     for ax, (column, words) in zip(axes, columns.items(), strict=True):
         ax.barh(names, [row[column] or 0.0 for row in table], color=plot.COLOURS[0])
@@ -181,7 +273,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
         if name in (config.controllers or (name,)):
             table.append(judge(config, name, build(), cars))
             print(table[-1], flush=True)
-    record.print_rows("Seven controllers on the same stops", table)
+    record.print_rows("Eight controllers on the same stops", table)
     return record.experiment(config, {"table": table}, figures(table))
 
 

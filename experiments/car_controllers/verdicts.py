@@ -1,4 +1,4 @@
-"""The verdicts of the seven controllers on every clause, for one car: a page, and a table in Markdown.
+"""The verdicts of the eight controllers on every clause, for one car: a page, and a table in Markdown.
 
 Each assessment is a JSON file as `diffabs assess --json` writes it; `diffabs report` makes the page of them.
 
@@ -41,7 +41,7 @@ def judge_controllers(names: Sequence[str] = (), folder: pathlib.Path = FOLDER) 
         folder.mkdir(parents=True, exist_ok=True)
         files.write_file(paths[-1], text.encode())
         print(name, [f"{row.number} {row.verdict}" for row in assessments[name].clauses], flush=True)
-    write_report(paths, folder / PAGE, "Seven brake controllers on the clauses")
+    write_report(paths, folder / PAGE, "Eight brake controllers on the clauses")
     return assessments
 
 

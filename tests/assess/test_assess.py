@@ -22,10 +22,27 @@ from diffabs.core.validity import check_part
 from diffabs.host.values import as_plain
 from diffabs.parts.objectives import RiseTime
 from diffabs.parts.plants import GRAVITY, Car, HalfCar
+from diffabs.parts.roads import ICE, WET_ASPHALT, RelaxedTyre, RoadTyre
 from diffabs.scenario import dump, load, loads
 
 SOLVER = d.Adaptive(1e-5, 5.0)
 KMH = 1 / 3.6
+
+
+@killed_by("assess.runs", 'f"{name}.tyre" if hasattr(getattr(plant, name), "relax") else name', "name")
+def test_a_relaxation_length_stays_on_the_roads_of_the_stops(monkeypatch):
+    """The tyre inside gets the road; the surfaces may be other curves than those of the program."""
+    made = {}
+    monkeypatch.setattr(
+        "diffabs.assess.runs.run_batch", lambda loop, batch, *args, **kwargs: made.update(loop=loop, batch=batch)
+    )
+    loop = replace(load("half-car").loop, {"plant.front_tyre": RelaxedTyre(length=0.2)})
+    stops = plan_stops(loop.plant, Program())
+    run_stops(loop, SOLVER, stops, Program(), surfaces=(WET_ASPHALT, ICE))
+    tyre = made["loop"].plant.front_tyre
+    assert (type(tyre), tyre.length, type(tyre.tyre)) == (RelaxedTyre, 0.2, RoadTyre)
+    first = made["batch"].values["plant.front_tyre.tyre.road.roads.0.c1"]
+    np.testing.assert_array_equal(first, [(ICE if stop.left_side[0] else WET_ASPHALT).c1 for stop in stops])
 
 
 @killed_by("assess.surfaces", "road.c1 - road.c3 / road.c2", "road.c1 + road.c3 / road.c2")

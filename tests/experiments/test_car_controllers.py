@@ -10,6 +10,7 @@ from reports import Page
 
 from diffabs.assess import RuleStop, StopProgram
 from diffabs.parts.plants import GRAVITY
+from diffabs.parts.roads import Burckhardt
 
 STORED = ROOT / "experiments" / "car_controllers" / "numbers.json"
 
@@ -29,10 +30,19 @@ def test_the_shortest_distance_is_that_of_friction(study):
 
 def test_no_stored_controller_stops_before_the_shortest_distance():
     table = json.loads(STORED.read_text())["tables"]["table"]
-    assert len(table) == 7
+    assert len(table) == 8
     for row in table:
         assert row["lost runs"] == 0
-        assert min(row["good, 120 km/h [% over least]"], row["slippery, 55 km/h [% over least]"]) > 0
+        assert min(value for column, value in row.items() if "over least" in column) > 0
+
+
+def test_the_shortest_distance_on_a_road_is_that_of_its_peak(study):
+    """Burckhardt's curve without a factor of the speed has one greatest friction."""
+    road = Burckhardt(c1=0.857, c2=33.822, c3=0.347, c4=0.0)
+    slip = np.log(0.857 * 33.822 / 0.347) / 33.822
+    friction = 0.857 * (1 - np.exp(-33.822 * slip)) - 0.347 * slip
+    expected = (25.0**2 - (15 / 3.6) ** 2) / (2 * GRAVITY * friction)
+    assert study.shortest_on(road, 90.0) == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.slow

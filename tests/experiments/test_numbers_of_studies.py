@@ -191,7 +191,9 @@ def stops_of_controllers(tables):
         locked = [f"{row[name]:.2f} s" for name in row if name.startswith("locked")]
         split = [f"{row['split: distance [m]']:.1f} m", f"{row['split: yaw [rad]']:.2f} rad"]
         split += [f"{row['split: lateral [m]']:.2f} m", f"{row['split: steering wheel [deg]']:.0f} deg"]
-        return [*percent, *locked, *split, f"{row['all clauses [% of cars]']:.1f} %"]
+        lanes = [f"{row[name]:.1f} m" for name in row if name.startswith("lane change")]
+        work = f"{row['brake work, good, 120 km/h [kJ]']:.0f} kJ"
+        return [*percent, *locked, *split, *lanes, work, f"{row['all clauses [% of cars]']:.1f} %"]
 
     return {row["controller"]: cells(row) for row in tables["table"]}
 

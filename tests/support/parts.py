@@ -212,6 +212,7 @@ PARTS: dict[str, dict[str, Any]] = {
         "quadratic": objectives.QuadraticCost(q=np.array([3.0, 2.0]), r=0.5),
         "share at a limit": objectives.ShareAtLimit(high=12.0),
         "effort": objectives.Effort(),
+        "brake work": objectives.BrakeWork(radius=0.3),
         "torque rate": objectives.TorqueRate(),
         "variation": objectives.Variation(),
         "peak output": objectives.PeakOutput(output="distance", until=0.1995),
@@ -444,6 +445,7 @@ VALUES = {  # of the objectives on those runs, by hand
     + (2 + 0.5 * 25) * 0.64 * T / 2 * (1 - E**2),
     "share at a limit": 69.5e-3 / 0.5,  # 5 e >= 2 until T log(2) = 0.0693: 69 steps, and half of the next
     "effort": 100 * 0.5 + 100 * 0.8 * T * (1 - E) + 25 * 0.64 * T / 2 * (1 - E**2),
+    "brake work": (70 + 64 * T * (1 - E) - 32 * (T**2 - (T**2 + T * 0.5) * E)) / 0.3,
     "variation": 4.0 * (1 - E),
     "balance: settling_time": T * np.log(0.6 / 0.01),
     "balance: peak_lean": 0.3,

@@ -1,6 +1,6 @@
-"""A driver who steers against a side wind, a slope or unequal brakes: the car stays near the line on which it started.
+"""A driver who steers against a side wind, a slope or unequal brakes: the car stays near a line along the road.
 
-    steer angle = -clamp(k (y + p sin(yaw)), -full, full)
+    steer angle = -clamp(k (y - line + p sin(yaw)), -full, full)
 
 y + p sin(yaw) is the lateral position of a point p ahead of the car. Plant and actuator have the lags of steering.
 
@@ -19,7 +19,7 @@ from diffabs.parts.controllers.per_channel import PerChannel
 
 @pytree
 class HoldCourse(ChangedCommand):
-    """The commands of a controller of the brakes, and the steer angle of a driver who holds the line of the start.
+    """The commands of a controller of the brakes, and the steer angle of a driver who holds a line along the road.
 
     The plant needs the control `steer_angle` and the outputs `lateral_position` and `yaw`, as `plants.Car` has them.
 
@@ -35,11 +35,13 @@ class HoldCourse(ChangedCommand):
     """Steer angle k per lateral distance of the point ahead; 0 for hands off the wheel."""
     preview: Scalar = param(default=15.0, unit="m", low=0.0)
     """Distance p of this point."""
+    line: Scalar = param(default=0.0, unit="m")
+    """Lateral position of the line, to the left of the start."""
     full_angle: Scalar = param(default=0.13, unit="rad", above=0.0)
     """Greatest steer angle; 120 degrees at the steering wheel with a ratio of 16."""
 
     def change(self, t: Scalar, command: PyTree, signal: Tracking) -> PyTree:
         """Return the commands with the driver's steer angle [rad]."""
         del t
-        ahead = signal.measured.lateral_position + self.preview * jnp.sin(signal.measured.yaw)
+        ahead = signal.measured.lateral_position - self.line + self.preview * jnp.sin(signal.measured.yaw)
         return command._replace(steer_angle=-clamp(self.gain * ahead, -self.full_angle, self.full_angle))

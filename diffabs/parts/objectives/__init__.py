@@ -14,6 +14,7 @@ from diffabs.parts.objectives.balance import PeakTorque as PeakTorque
 from diffabs.parts.objectives.balance import PeakVoltage as PeakVoltage
 from diffabs.parts.objectives.balance import RestTime as RestTime
 from diffabs.parts.objectives.balance import SoftLoss as SoftLoss
+from diffabs.parts.objectives.braking import BrakeWork as BrakeWork
 from diffabs.parts.objectives.braking import Effort as Effort
 from diffabs.parts.objectives.braking import LockedTime as LockedTime
 from diffabs.parts.objectives.braking import RiseTime as RiseTime

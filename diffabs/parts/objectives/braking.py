@@ -7,7 +7,7 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.numerics import larger
+from diffabs.core.numerics import larger, quotient
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import param, pytree
 from diffabs.core.rules import Rule, order_rule
@@ -158,6 +158,25 @@ class Effort(Integral):
         """Return u^2."""
         del memory
         return sample.control**2
+
+
+@pytree
+class BrakeWork(Integral):
+    """Work of a brake on its wheel [J]: the integral of torque and rim speed over the radius.
+
+    With `InChannel` it is the work of one wheel or axle of a car.
+    """
+
+    unit = "J"
+    physical: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
+
+    radius: Scalar = param(default=0.344, unit="m", above=0.0)
+    """Radius of the wheel."""
+
+    def flow(self, memory: Memory, sample: Sample) -> Scalar:
+        """Return the power of the brake [W]."""
+        del memory
+        return quotient(sample.control * sample.output.wheel_speed, self.radius)
 
 
 class Varied(NamedTuple):
