@@ -51,8 +51,9 @@ def test_engines_and_modes_agree_on_loops_of_channels(name, monkeypatch):
 
 
 # Of scenarios with several inputs: test_channels.py, test_half_car.py and test_car.py compare their derivatives.
-# Parts of a car: test_threshold_logic.py, test_car.py and the tests of sensors and actuators differentiate them.
-OF_A_CAR = {"FivePhase", "HoldCourse", "HydraulicBrake", "OutputError", "SelectHigh"}
+# Parts of a car: test_threshold_logic.py, test_brake_distribution.py, test_car.py and the tests of sensors and
+# actuators differentiate them.
+OF_A_CAR = {"BrakeDistribution", "FivePhase", "HoldCourse", "HydraulicBrake", "OutputError", "SelectHigh"}
 ONE_PLANT = {
     "QuadrupleTank",
     "TankStart",

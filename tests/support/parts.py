@@ -244,6 +244,9 @@ WITH_CHANNELS: dict[str, dict[str, Any]] = {
         "per channel, one": controllers.PerChannel(_PID, TANK),
         "select low": controllers.SelectLow(controller=controllers.PerChannel(_PID, TANK), groups=(tuple(TANK),)),
         "hold course": controllers.HoldCourse(controller=controllers.PerChannel(_PID, TANK), gain=0.05),
+        "brake distribution": controllers.BrakeDistribution(
+            controller=_PID, knee=2.0, valve_ratio=0.5, controlled="level_1", front=("pump_1",), rear=("pump_2",)
+        ),
         "matrix feedback": controllers.MatrixFeedback(
             gain=-np.arange(1.0, 13.0).reshape(2, 6),
             outputs_at_rest=np.full(4, 0.1),

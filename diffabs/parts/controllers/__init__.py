@@ -7,6 +7,7 @@ from diffabs.parts.controllers.antiwindup import NoAntiWindup as NoAntiWindup
 from diffabs.parts.controllers.balance import BalanceFeedback as BalanceFeedback
 from diffabs.parts.controllers.balance import ObserverFeedback as ObserverFeedback
 from diffabs.parts.controllers.cascade import Cascade as Cascade
+from diffabs.parts.controllers.distribution import BrakeDistribution as BrakeDistribution
 from diffabs.parts.controllers.driver import HoldCourse as HoldCourse
 from diffabs.parts.controllers.feedback import StateFeedback as StateFeedback
 from diffabs.parts.controllers.feedforward import ConstantInput as ConstantInput

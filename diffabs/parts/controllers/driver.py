@@ -37,8 +37,8 @@ class HoldCourse(ChangedCommand):
     """Distance p of this point."""
     line: Scalar = param(default=0.0, unit="m")
     """Lateral position of the line, to the left of the start."""
-    full_angle: Scalar = param(default=0.13, unit="rad", above=0.0)
-    """Greatest steer angle; 120 degrees at the steering wheel with a ratio of 16."""
+    full_angle: Scalar = param(default=0.5, unit="rad", above=0.0)
+    """Lock of the front wheels, the greatest steer angle; 458 degrees at the steering wheel with a ratio of 16."""
 
     def change(self, t: Scalar, command: PyTree, signal: Tracking) -> PyTree:
         """Return the commands with the driver's steer angle [rad]."""

@@ -97,7 +97,7 @@ class SelectLow(ChangedCommand):
         """Return the commands, with the least one in each group."""
         del t, signal
         for group in self.groups:
-            _check_group(group, command)
+            check_group("groups", group, command)
             lowest = reduce(smaller, (select_channel(command, name) for name in group))
             command = command._replace(**dict.fromkeys(group, lowest))
         return command
@@ -112,11 +112,13 @@ class SelectLow(ChangedCommand):
                 yield f"groups: a group is empty; {needed}"
 
 
-def _check_group(group: tuple[str, ...], command: Any) -> None:
-    """Raise ValueError for a name that is no control, or for controls with different units."""
-    if unknown := [name for name in group if name not in command._fields]:
-        raise ValueError(f"groups: there is no control {', '.join(unknown)}; there is {', '.join(command._fields)}")
+def check_group(field: str, group: tuple[str, ...], command: Any) -> None:
+    """Raise ValueError for a name that is no control, or for controls with different units; `field` has the names."""
+    controls = getattr(command, "_fields", ())
+    if unknown := [name for name in group if name not in controls]:
+        offered = f"there is {', '.join(controls)}" if controls else "the plant has a single control without a name"
+        raise ValueError(f"{field}: there is no control {', '.join(unknown)}; {offered}")
     units = {name: type(command).units[name] for name in group}
     if len({*units.values()}) > 1:
         named = ", ".join(f"{name} [{unit}]" for name, unit in units.items())
-        raise ValueError(f"groups: {named} have different units; the least of them is meaningless")
+        raise ValueError(f"{field}: {named} have different units; they cannot have one command")
