@@ -64,13 +64,21 @@ class Group(typer.core.TyperGroup):
                 error.show()
             else:
                 text = " ".join(error.format_message().split()).removesuffix(".")
-                text = re.sub(r"^Invalid value for '(.*?)': (Value error, )?", r"\1: ", text)
+                value = _refused_value(error).replace("\\", r"\\")
+                text = re.sub(r"^Invalid value for '(.*?)': (Value error, )?", rf"\1{value}: ", text)
                 where = error.ctx.command_path if error.ctx else "diffabs"
                 console.say(f"error: {text[:1].lower()}{text[1:]} ({where} --help)")
             status = error.exit_code
         if standalone_mode:
             sys.exit(status)
         return status
+
+
+def _refused_value(error: Any) -> str:
+    """Return " = VALUE" for a value that Typer's validation refused without naming it, or ""."""
+    errors = getattr(error.__cause__, "errors", None)  # of a pydantic.ValidationError
+    value = errors()[0]["input"] if errors else ""
+    return f" = {value}" if errors and str(value) not in str(error) else ""
 
 
 @functools.cache

@@ -29,8 +29,10 @@ import pathlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import ParameterSpec, elements, get
+from diffabs.core.pytree import ParameterSpec, elements, get, parameters
 from diffabs.core.types import JsonObject, Params, PyTree, Table
 from diffabs.host.values import (
     ScenarioError,
@@ -246,13 +248,20 @@ def read_failure(text: str, scenario: Any) -> tuple[str, float]:
     return metric, scenario.sweep.failures[metric]
 
 
+def _example_range(loop: Loop) -> str:
+    """Return an entry of [sweep.over] for the plant: 10 % around the first of its positive numbers."""
+    numbers = ((path, value) for path, _, value in parameters(loop.plant, "plant."))
+    path, value = next((path, float(value)) for path, value in numbers if np.ndim(value) == 0 and value > 0)
+    return f'"{path}" = {{ low = {0.9 * value:.4g}, high = {1.1 * value:.4g} }}'
+
+
 def build_study(scenario: "Scenario") -> "Study":
     """Return the sweep of a scenario."""
     from diffabs.uncertainty.sweep import Study
 
     plan: SweepSection = scenario.sweep
     if not plan.over:
-        raise ScenarioError('sweep.over is empty; for example [sweep.over] "plant.mass" = { low = 5.3, high = 6.2 }')
+        raise ScenarioError(f"sweep.over is empty; for example [sweep.over] {_example_range(scenario.loop)}")
     choices = {path: item for path, item in plan.over.items() if isinstance(item, Choice)}
     variables = {path: item.names if path in choices else item for path, item in plan.over.items()}
     space = Space(variables, plan.correlation, plan.design)

@@ -201,7 +201,10 @@ class AugmentedLagrangianSearch:
                 return f"{finding}: such a run never settles; start from one that does, or take iae"
             if lost := np.count_nonzero(~np.isfinite(value)):
                 return f"{name} is not finite at the start in {lost} of {lanes} lanes"
-        return "the objective, a constraint or a derivative is not finite at the start"
+        return (
+            "the objective, a constraint or a derivative is not finite at the start; a run that slides, as with"
+            " clamping at rest on its target, has no derivatives"
+        )
 
     def _values(self, z: np.ndarray) -> dict[str, PyTree]:
         return {path: np.asarray(value) for path, value in self.problem.space.values(z).items()}

@@ -207,7 +207,12 @@ def test_an_impossible_program_is_refused(change, line):
         (["half-car", "--high", "0.55"], "assess.high = 0.55 is below 2 low = 0.6; clause 5.3.2 needs that ratio"),
         (["half-car", "--set", "assess=3"], "assess = 3 is a number; a table of high, low, load"),
         (["lab-rig", "--set", "assess.load=3"], "assess: LabRig has no tyres with roads"),
-        (["half-car", "--cars", "5"], "sweep.over is empty"),
+        (
+            ["half-car", "--cars", "5"],
+            'sweep.over is empty; for example [sweep.over] "plant.mass" = { low = 984, high = 1203 }',
+        ),
+        (["half-car", "--cars", "-1"], "-1"),
+        (["half-car", "--high", "abc"], "abc"),
     ],
 )
 def test_the_command_refuses_in_a_line(words, line):

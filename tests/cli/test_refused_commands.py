@@ -36,7 +36,7 @@ REFUSALS = [
     # usage
     ("sweep slip-lmi --workers 0 --on dask", 2, ["--workers 0 is outside [1, 8]"]),
     ("sweep slip-lmi --devices 0", 2, ["--devices 0 is outside [1, 8]"]),
-    ("rare slip-lmi iae --samples many", 2, ["--samples: "]),
+    ("rare slip-lmi iae --samples many", 2, ["--samples", "many"]),
     ("simulate --nonsense", 2, ["no such option: --nonsense"]),
     ("design", 2, ["missing argument"]),
     ("simulat", 2, ["Did you mean 'simulate'?"]),

@@ -38,7 +38,8 @@ class BrakeDistribution(Parallel):
 
     Notes:
         The controller sees the target and the output `controlled`, and the sum of the feed-forwards of all brakes. A
-        `ConstantTorque` or a `Playback` is a pedal without anti-lock brakes. With `valve_ratio` 1 there is no valve.
+        `ConstantTorque` or a `PlayedCommand` is a pedal without anti-lock brakes. With a `valve_ratio` of 1 there is no
+        valve.
 
     Examples:
         >>> from diffabs.parts.controllers import BrakeDistribution, ConstantTorque
