@@ -53,7 +53,7 @@ class AxleAdhesion(NamedTuple):
     height: Array
     wheelbase: Array
 
-    def weigh(self, rate: Array, stops: list[RuleStop]) -> Array:
+    def mean_adhesion(self, rate: Array, stops: list[RuleStop]) -> Array:
         """Return k_M for the braking rates of stops with anti-lock brakes [1], both of shape (cars, stops).
 
         It is the mean of both axles, weighted by their loads at these rates; k_f where the rear axle does not count.

@@ -50,4 +50,4 @@ def find_excess(row: Figures, failed: Array) -> Array:
     """Return the excesses of a clause in its stops, over the limit in units of it, NaN for a run that failed."""
     beyond = row.limit - row.values if row.at_least else row.values - row.limit
     scale = jnp.where(jnp.asarray(row.limit) == 0, 1.0, row.limit)
-    return jnp.where(failed[:, jnp.asarray(row.places)], jnp.nan, beyond / scale).ravel()
+    return jnp.where(failed[:, jnp.asarray(row.stop_indices)], jnp.nan, beyond / scale).ravel()

@@ -41,7 +41,7 @@ class Figures(NamedTuple):
         limit: Limit of the figures.
         unit: Unit of both.
         at_least: Whether a figure must be at least, or at most the limit.
-        places: Indices of the stops.
+        stop_indices: Which stops of a car they are.
         confirmed: Whether the rule stands in a text that was read.
         repeat_above: Figure above which the regulation asks to repeat the measurement; the verdict stays.
     """
@@ -52,7 +52,7 @@ class Figures(NamedTuple):
     limit: Scalar
     unit: str
     at_least: bool
-    places: tuple[int, ...]
+    stop_indices: tuple[int, ...]
     confirmed: bool = True
     repeat_above: float = np.inf
 
@@ -198,13 +198,13 @@ def clause_figures(
     adhesion = jnp.stack([jnp.asarray(program.low if stop.left_side[0] else program.high, float) for stop in stops])
     used, origin = rate / adhesion, ""
     if measured:
-        used, origin = rate / measured.weigh(rate, stops), ", k by one axle"
+        used, origin = rate / measured.mean_adhesion(rate, stops), ", k by one axle"
 
     def row(
         number: str, rule: str, kind: str, values: Array, limit: Scalar, unit: str, at_least: bool = False
     ) -> Figures:
-        places = tuple(place for place, stop in enumerate(stops) if stop.kind == kind)
-        return Figures(number, rule, values[:, jnp.asarray(places)], limit, unit, at_least, places)
+        indices = tuple(index for index, stop in enumerate(stops) if stop.kind == kind)
+        return Figures(number, rule, values[:, jnp.asarray(indices)], limit, unit, at_least, indices)
 
     rows = [
         row("5.2.1", f"utilised adhesion from 55 km/h{origin}", "adhesion", used, 0.75, "1", at_least=True)._replace(
@@ -238,7 +238,7 @@ def judge_clause(figures: Figures, stops: list[RuleStop], failed: np.ndarray) ->
         failed: Runs that diverged or did not end, shape (cars, stops); they count neither as met nor as not met.
     """
     values = np.asarray(figures.values)
-    missed = failed[:, list(figures.places)] | np.isnan(values)  # NaN: a run that measures k failed
+    missed = failed[:, list(figures.stop_indices)] | np.isnan(values)  # NaN: a run that measures k failed
     finished = np.where(missed, np.nan, values)
     worst = np.full_like(finished, np.inf if figures.at_least else -np.inf)
     worst = np.where(np.isnan(finished), worst, finished)
@@ -252,7 +252,7 @@ def judge_clause(figures: Figures, stops: list[RuleStop], failed: np.ndarray) ->
         float(figures.limit),
         figures.unit,
         figures.at_least,
-        stops[figures.places[column]].describe(),
+        stops[figures.stop_indices[column]].describe(),
         figures.confirmed,
         np.all(within, axis=1),
         int(np.sum(missed)),
@@ -270,5 +270,5 @@ def _note_repeat(figures: Figures, stops: list[RuleStop], finished: np.ndarray) 
     highest, column = np.nanmax(finished), np.unravel_index(np.nanargmax(finished), finished.shape)[1]
     if np.round(highest, 2) <= figures.repeat_above:
         return ""
-    where = stops[figures.places[column]].describe()
+    where = stops[figures.stop_indices[column]].describe()
     return f"{highest:.2f} in {where} is above {figures.repeat_above:.2f}: measure k again (App. 2, 1.3)"

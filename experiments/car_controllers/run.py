@@ -246,7 +246,7 @@ def _met(row: Any, lost: np.ndarray) -> np.ndarray:
     """Return whether each car meets a clause."""
     values = np.asarray(row.values)
     within = values >= row.limit if row.at_least else values <= row.limit
-    return np.all(within & ~lost[:, list(row.places)], axis=1)
+    return np.all(within & ~lost[:, list(row.stop_indices)], axis=1)
 
 
 def figures(table: list[dict[str, Any]]) -> dict[str, Any]:

@@ -48,7 +48,7 @@ def test_the_car_has_the_mean_by_its_dynamic_loads(height):
     ends = jnp.array([[0.8, 0.3], [0.7, 0.28]])
     shape = (np.array([[CAR.to_rear / BASE]]), np.array([[height / BASE]]), np.array([[BASE]]))
     axles = AxleAdhesion(ends[None], 0.9 * ends[None], *map(jnp.asarray, shape))
-    of_stops = axles.weigh(jnp.full((1, len(stops)), 0.2), stops)[0]
+    of_stops = axles.mean_adhesion(jnp.full((1, len(stops)), 0.2), stops)[0]
     shift = height / BASE * 0.2 * MASS * GRAVITY
     front, rear = STATIC["front"] + shift, STATIC["rear"] - shift
     for stop, value in zip(stops, of_stops, strict=True):
