@@ -145,19 +145,32 @@ def run_unchecked(
     if not (key is None or np.ndim(key) or jnp.issubdtype(getattr(key, "dtype", float), jax.dtypes.prng_key)):
         raise ValueError(f"key = {kinds.format_value(key)} is no random key; one of jax.random.key is needed")
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
-    steps, every = solver.steps, int(every)
-    count = -(-steps // every) if every else 0
-    between = min(every, steps) if every else round_up_capacity(steps)
-    room = round_up_capacity(log_capacity(loop, solver)) if isinstance(solver, Adaptive) else between
-    plan = RunPlan(finish_run, observe, room, round_up_capacity(count) if every else 0, every)
-    # Capacities are static and rounded up, so that similar durations share one compiled program.
+    plan = plan_run(loop, solver, int(every))
     arguments = loop, objectives, method, key
     if not every and engine != "xla" and is_traced(loop, objectives, key):
         return run_deferred(run_differentiable, plan, arguments, required=engine == "kernel")
     run = run_differentiable(plan, arguments)
-    return run._replace(trajectory=_truncate_trajectory(run.trajectory, count + 1)) if every else run
+    return cut_trajectory(run, solver, every) if every else run
 
 
-@partial(jax.jit, static_argnums=1)
-def _truncate_trajectory(trajectory: object, count: int) -> PyTree:
-    return jax.tree.map(lambda x: x[:count], trajectory)
+def plan_run(loop: Loop, solver: Solver, every: int) -> RunPlan:
+    """Return the plan of a run; `every` is the stride of the trajectory's instants, or 0 for none."""
+    steps = solver.steps
+    between = min(every, steps) if every else round_up_capacity(steps)
+    # Capacities are static and rounded up, so that similar durations share one compiled program.
+    room = round_up_capacity(log_capacity(loop, solver)) if isinstance(solver, Adaptive) else between
+    return RunPlan(finish_run, observe, room, round_up_capacity(_count_instants(solver, every)) if every else 0, every)
+
+
+def cut_trajectory(run: Run, solver: Solver, every: int, axis: int = 0) -> Run:
+    """Return the run with the planned instants of its trajectory; the capacity has more. They lie along the `axis`."""
+    return run._replace(trajectory=_cut(run.trajectory, _count_instants(solver, every) + 1, axis))
+
+
+def _count_instants(solver: Solver, every: int) -> int:
+    return -(-solver.steps // every)
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _cut(trajectory: object, count: int, axis: int) -> PyTree:
+    return jax.tree.map(lambda x: jax.lax.slice_in_dim(x, 0, count, axis=axis), trajectory)

@@ -202,15 +202,19 @@ class TestObjections:
         with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
             d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="gpu")
 
-    @killed_by(
-        "loop.ensemble",
-        "why_not = TOGETHER_REASON if trajectories or together else",
-        "why_not = TOGETHER_REASON if False else",
-    )
-    @pytest.mark.parametrize("more", [{"together": True}, {"trajectories": True}])
-    def test_of_lanes_that_run_together(self, more):
+    @killed_by("loop.ensemble", 'why_not = TOGETHER_REASON if together else ""', 'why_not = ""')
+    def test_of_lanes_that_run_together(self):
         with pytest.raises(ValueError, match="together, for trajectories or for derivatives"):
-            d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="kernel", accepted=True, **more)
+            d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="kernel", accepted=True, together=True)
+
+    @killed_by("loop.ensemble", "if trajectories and (traced or", "if trajectories and (False or")
+    def test_of_trajectories_with_derivatives(self):
+        def slip(gain):
+            loop = d.replace(LOOP, {"controller.gain.0": gain})
+            return d.run_batch(loop, d.Batch(VALUES, KEYS), SOLVER, trajectories=True, engine="kernel").metrics
+
+        with pytest.raises(ValueError, match="trajectories on a processor only, and of a call that is not traced"):
+            jax.jit(slip)(-4000.0)
 
     @pytest.mark.slow
     def test_of_reverse_mode_where_runs_make_room_for_others(self):

@@ -90,6 +90,17 @@ class SortedTorque:
         return Memory(held=jax.lax.sort(jnp.stack([self.torque, signal.target]))[1])
 
 
+@pytree
+class Arrived:
+    """The run ends at x = 0.4."""
+
+    far: Any = param(default=0.4, unit="m")
+    success, remainder = True, stops.NoStop.remainder
+
+    def margin(self, output):
+        return self.far - output.x
+
+
 STARTS = ("classify_starts", "region_of_attraction", "largest_recovered_multiples", "recoverable_multiple")
 NONE = f"{toolchain.COMPILER} is empty"
 
@@ -108,13 +119,47 @@ def no_compiler(monkeypatch):
     jax.clear_caches()
 
 
+@killed_by("engine.drive.kernel", "until=until)", "until=until + 1)")
+@killed_by(
+    "engine.drive.loops", "return i + 1, any_lane(jnp.any(sample.running))", "return i + 1, sample.running.all()"
+)
+@killed_by("loop.ensemble", "return cut_trajectory(run, solver, solver.every, axis=1)", "return run")
+def test_a_kernel_keeps_trajectories():
+    """Until each run ends at its own time, here of x = (1 - exp(-rate t))/rate; the second run is refused."""
+    loop, solver = dataclasses.replace(decay_loop(), stop=Arrived()), d.FixedStep(0.01, 1.0, every=3)
+    rates, accepted = np.array([1.0, 2.0, 3.0]), np.array([True, False, True])
+    lanes = d.Batch({"plant.rate": rates})
+    run = jax.device_get(d.run_batch(loop, lanes, solver, trajectories=True, accepted=accepted, engine="kernel"))
+    assert run.diverged.tolist() == [False, True, False]
+    assert run.stopped.tolist() == [True, False, False]
+    assert run.trajectory.running.sum(axis=1).tolist() == [18, 0, 34]
+    for i, end in ((0, -np.log(1.0 - 0.4)), (2, 1.0)):
+        t = np.minimum(0.03 * np.arange(35), end)
+        np.testing.assert_allclose(run.trajectory.sample.t[i], t, atol=1e-7)
+        expected = (1.0 - np.exp(-rates[i] * t)) / rates[i]
+        np.testing.assert_allclose(run.trajectory.sample.output.x[i], expected, atol=1e-7)
+
+
+@pytest.mark.slow
+@killed_by("engine.drive.kernel", "return method.keep_steps(_stop_unaccepted(accepted, begins))", "return begins")
+def test_a_kernel_keeps_trajectories_of_adaptive_steps():
+    lanes, solver = d.Batch({"initial.speed": [20.0, 25.0]}), d.Adaptive(1e-6, 3.0, 1e-3, every=70)
+    run = jax.device_get(d.run_batch(LOOP, lanes, solver, trajectories=True, engine="kernel"))
+    for i in range(2):
+        expected = jax.device_get(d.rollout(lanes.lane(LOOP, i), solver)).trajectory
+        jax.tree.map(
+            lambda x, y: np.testing.assert_allclose(x[i], y, rtol=1e-8, atol=1e-8),  # noqa: B023
+            *(run.trajectory, expected),
+        )
+
+
 class TestDefault:
     """Nobody names an engine."""
 
     @killed_by("engine.drive.engine", "and (why_not or why_xla):", "and why_not:")
     @killed_by("engine.drive.engine", "log_own_choice(why_not or why_xla)", "log_xla_reason(why_not or why_xla)")
     def test_trajectories_are_those_of_xla(self, users_engine, caplog):
-        """With no warning, since a kernel makes none."""
+        """With no warning: a kernel makes them on request only."""
         log_own_choice.cache_clear()
         with caplog.at_level(logging.INFO, "diffabs"):
             d.run_batch(decay_loop(), d.Batch({"plant.rate": [1.0, 2.0]}), d.FixedStep(0.1, 0.2), trajectories=True)

@@ -20,8 +20,11 @@ from marks import cases
 from mutants import killed_by
 from seams import replace_seam
 
+from diffabs import sensors
 from diffabs.cli import console
 from diffabs.core.pytree import get, parameters, replace
+from diffabs.engine.drive.engine import EngineError
+from diffabs.engine.solvers import FixedStep
 from diffabs.host.values import ScenarioError
 from diffabs.linear import margins, open_loop
 from diffabs.linear.opened_loop import OpenLoop
@@ -29,7 +32,7 @@ from diffabs.linear.robustness import System
 from diffabs.linear.stability_margins import closed_loop_poles
 from diffabs.linear.transfer import Transfer
 from diffabs.loop.run import rollout
-from diffabs.output.explore import charts, curves, frequency_charts, friction, saving, stability, tuning
+from diffabs.output.explore import charts, curves, frequency_charts, friction, members, saving, stability, tuning
 from diffabs.output.explore.knobs import SLIDER_STEPS, is_vehicle
 from diffabs.output.explore.panels import Curve, Curves, Fan, Panel, Spread
 from diffabs.output.explore.session import AS_GIVEN, Session, check_edit, load_basis
@@ -352,11 +355,14 @@ def test_a_fan_has_the_quantiles_of_its_runs(session, monkeypatch):
     assert words == "mass ± 10 %, friction ± 30 %"
     by = curves.drawing_solver(chosen, curves.DRAFT_INSTANTS)
     each = [replace(chosen.loop, {path: column[i] for path, column in values.items()}) for i in range(5)]
-    stride = round(found.t[1] / (by.step * by.every))
-    slips = [np.asarray(rollout(loop, by).trajectory.sample.output.slip)[::stride] for loop in each]
+    slips = np.array([rollout(loop, by).trajectory.sample.output.slip for loop in each])
     early = slice(0, 50)  # all of them still run
-    expected = np.quantile([slip[early] for slip in slips], curves.QUANTILES, axis=0)
-    np.testing.assert_allclose(found.bands[0][:, early], expected, rtol=1e-9, atol=1e-12)
+
+    def places(found):
+        return np.round(found.t[early] / (by.step * by.every)).astype(int)
+
+    expected = np.quantile(slips[:, places(found)], curves.QUANTILES, axis=0)
+    np.testing.assert_allclose(found.bands[0][0][:, early], expected, rtol=1e-9, atol=1e-12)
     for path, part in ((friction.FACTOR_PATH, 0.3), ("plant.mass", 0.1)):
         here = float(get(chosen.loop, path))
         assert np.all(np.abs(values[path] / here - 1) <= part)
@@ -365,9 +371,8 @@ def test_a_fan_has_the_quantiles_of_its_runs(session, monkeypatch):
     replace_seam(monkeypatch, "is_step_stable", lambda loop, values, step: heavy)
     found = curves.run_fan(chosen, spread)
     assert (found.members, found.refused, found.diverged) == (5, np.sum(~heavy), 0)
-    kept = [slip[early] for slip, run in zip(slips, heavy, strict=True) if run]
-    expected = np.quantile(kept, curves.QUANTILES, axis=0)
-    np.testing.assert_allclose(found.bands[0][:, early], expected, rtol=1e-9, atol=1e-12)
+    expected = np.quantile(slips[heavy][:, places(found)], curves.QUANTILES, axis=0)
+    np.testing.assert_allclose(found.bands[0][0][:, early], expected, rtol=1e-9, atol=1e-12)
 
 
 @killed_by("output.explore.curves", "KMH * line.values", "line.values")
@@ -683,7 +688,7 @@ def test_speeds_of_a_plant_without_a_wheel_stay_in_si(session):
     assert session.knobs["initial.speed"].spec.unit == "km/h"
 
 
-@killed_by("output.explore.curves", "(KEPT_MULTIPLE * instants))", "instants)")
+@killed_by("output.explore.curves", "(multiple * instants))", "instants)")
 @pytest.mark.slow
 @pytest.mark.parametrize("draft", [False, True])
 def test_a_run_that_stops_early_is_drawn_whole(file, draft):
@@ -695,9 +700,9 @@ def test_a_run_that_stops_early_is_drawn_whole(file, draft):
     assert 0.3 < found.t[-1] == pytest.approx(found.metrics["stop_time"], rel=1e-3)
 
 
-@killed_by("output.explore.curves", "np.append(places, count - 1)", "places")
+@killed_by("output.explore.curves", "min(count, instants + 1)", "instants + 1")
 def test_curves_are_thinned_to_few_instants_and_the_last_one():
-    assert [len(curves.thin(count, 400)) for count in (0, 1, 2, 400, 401, 402, 6401)] == [0, 1, 2, 400, 401, 202, 401]
+    assert [len(curves.thin(count, 400)) for count in (0, 1, 2, 400, 401, 402, 6401)] == [0, 1, 2, 400, 401, 401, 401]
     assert curves.thin(403, 400)[-1] == 402
 
 
@@ -848,6 +853,105 @@ def test_the_goal_of_sensitivity_is_the_lower_bound(file):
     np.testing.assert_allclose(curve, [0.1, 0.1, math.sqrt(0.4), 2.0])
 
 
+@killed_by("output.explore.panels", "if self.quantity else self.lines[:1]", "if False else self.lines[:1]")
+@killed_by("output.explore.charts", "colour if several else GREY", "GREY")
+@killed_by("output.explore.charts", "colour, light=several", "BLUE, light=several")
+def test_each_wheel_has_its_fan_and_pinned_run():
+    """In the colour of its own curve; of signals that only share a unit, the first has them."""
+    names, slip, t = ("left", "right", "target", "target"), np.array([0.1, 0.2]), np.array([0.0, 1.0])
+    wheels = Panel("1", tuple(Curve(name, i * slip) for i, name in enumerate(names)), "slip")
+    speeds = Panel("km/h", (Curve("wheel speed", slip), Curve("speed", slip)))
+    found = Curves(t, (wheels, speeds), {}, "", draft=False)
+    before = charts.change_curves(found, "before")["dataset"][0]["source"]
+    assert before == {"t": [0.0, 1.0], "0.0": [0.0, 0.0], "0.1": [0.1, 0.2], "1.0": [0.1, 0.2]}
+    band = np.arange(5.0)[:, None] + slip
+    fan = charts.change_fan(Fan(t, ((band, 2 * band), (band,)), 200, 0, 0, ""))["dataset"][0]["source"]
+    assert fan["0.1.1"] == [2.0, 2.0]
+    drawn = charts.run_chart(found)["series"]
+    columns = {(line["datasetId"], line["encode"]["y"]): line for line in drawn}
+    assert {column for name, column in columns if name == "fan"} == {*fan} - {"t"}
+    assert {column for name, column in columns if name == "before"} == {*before} - {"t"}
+    for wheel in ("0.0", "0.1"):
+        colour = columns["now", wheel]["lineStyle"]["color"]
+        assert (
+            colour
+            == columns["before", wheel]["lineStyle"]["color"]
+            == columns["fan", f"{wheel}.1"]["areaStyle"]["color"]
+        )
+    assert columns["before", "1.0"]["lineStyle"]["color"] == charts.GREY
+    assert len({line["stack"] for line in drawn if "stack" in line}) == 3
+
+
+@pytest.fixture
+def large(monkeypatch, users_engine, session):
+    """A scenario whose loop counts as a large one."""
+    replace_seam(monkeypatch, "many_states", 3)
+    replace_seam(monkeypatch, "in_kernel", {})
+    return session.scenario()
+
+
+@killed_by("output.explore.members", "> MANY_STATES and _has_compiler()", "> MANY_STATES")
+@killed_by("output.explore.members", 'if default_engine() == "xla" or', "if")
+@killed_by("output.explore.curves", "multiple = KERNEL_MULTIPLE if takes_kernel(scenario) else", "multiple =")
+def test_a_large_loop_runs_in_a_kernel(large, monkeypatch):
+    """By the scenario's own solver, also during a drag, unless the machine or the user forbids it."""
+    long = dataclasses.replace(large, solver=FixedStep(1e-4, 4.0))
+    assert members.takes_kernel(long)
+    assert curves.draft_solver(long) is None
+    assert curves.drawing_solver(long).every == 25
+    monkeypatch.setenv("DIFFABS_ENGINE", "xla")
+    assert not members.takes_kernel(long)
+    assert curves.draft_solver(long) is not None
+    monkeypatch.delenv("DIFFABS_ENGINE")
+    monkeypatch.setenv("DIFFABS_KERNEL_COMPILER", "")
+    replace_seam(monkeypatch, "in_kernel", {})
+    assert not members.takes_kernel(long)
+
+
+def test_cars_are_large_and_single_wheels_small(users_engine, monkeypatch):
+    replace_seam(monkeypatch, "in_kernel", {})
+    assert {name: members.takes_kernel(load(name)) for name in ("car-jump", "slip-real", "half-car")} == {
+        "car-jump": True,
+        "slip-real": False,
+        "half-car": False,
+    }
+
+
+@killed_by("output.explore.members", "_in_kernel[jax.tree.structure(scenario.loop)] = False", "pass")
+def test_what_a_kernel_cannot_make_is_made_by_xla(large, monkeypatch):
+    asked = []
+
+    def refuse(*given, **more):
+        asked.append(more["engine"])
+        raise EngineError("no rule")
+
+    monkeypatch.setattr(members, "run_batch", refuse)
+    monkeypatch.setattr(members, "rollout", lambda *given, **more: "by XLA")
+    assert [members.run_alone(large, large.solver) for _ in range(2)] == ["by XLA"] * 2
+    assert asked == ["kernel"]
+
+
+@pytest.mark.slow
+@pytest.mark.slow
+@killed_by("output.explore.members", "Batch(shared | values, keys=np.arange(count) + scenario.seed)", "Batch(values)")
+@killed_by("output.explore.members", "float(get(scenario.loop, path))", "1.0")
+def test_runs_in_a_kernel_are_those_of_xla(large, monkeypatch):
+    noisy = dataclasses.replace(large, loop=dataclasses.replace(large.loop, sensor=sensors.Noise(slip=0.01)))
+    solver, values, accepted = FixedStep(1e-3, 0.2, every=7), {"plant.mass": np.array([5.3, 6.0])}, np.ones(2, bool)
+
+    def runs():
+        return members.run_alone(noisy, solver), members.run_members(noisy, values, solver, accepted)
+
+    kernel = runs()
+    monkeypatch.setenv("DIFFABS_ENGINE", "xla")
+    for made, expected in zip(kernel, runs(), strict=True):
+        for name in noisy.objectives if expected.metrics else ():
+            np.testing.assert_allclose(made.metrics[name], expected.metrics[name], rtol=1e-9)
+        jax.tree.map(
+            lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9), made.trajectory, expected.trajectory
+        )
+
+
 @killed_by("output.explore.charts", "third - quarter, high - third", "third - quarter, high - low")
 @killed_by("output.explore.charts", "greatest < DISPLAY_ROUNDING", "not greatest")
 def test_charts_are_plain_json_whatever_a_run_was():
@@ -863,9 +967,9 @@ def test_charts_are_plain_json_whatever_a_run_was():
     assert change["yAxis"] == [{}, {"min": 0, "max": 15.0, "interval": 5.0}]  # the command is beyond what can be given
     still = Panel("rad", (Curve("steer angle", np.array([0.0, 1e-16, np.nan])), Curve("command", np.zeros(3))))
     assert charts.change_curves(found._replace(panels=(still,)))["yAxis"] == [{"min": -1, "max": 1}]
-    bands = tuple(np.array([[0.0], [1.0], [2.0], [4.0], [8.0]]) for _ in range(2))
+    bands = tuple((np.array([[0.0], [1.0], [2.0], [4.0], [8.0]]),) for _ in range(2))
     steps = charts.change_fan(Fan(np.array([0.0]), bands, 200, 0, 0, ""))["dataset"][0]["source"]
-    assert [steps[f"0.{i}"] for i in range(4)] == [[0.0], [1.0], [3.0], [4.0]]  # each on top of the one before
+    assert [steps[f"0.0.{i}"] for i in range(4)] == [[0.0], [1.0], [3.0], [4.0]]  # each on top of the one before
     empty = [charts.pole_chart(), charts.change_poles(None)]
     empty += [frequency_charts.sensitivity_chart(), frequency_charts.nyquist_chart(), frequency_charts.bode_chart()]
     json.dumps([charts.run_chart(found), change, *empty], allow_nan=False)

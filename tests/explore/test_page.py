@@ -711,6 +711,18 @@ def test_a_quick_fan_is_slow_in_another_scenario(visit, monkeypatch):
     visit(user)
 
 
+@killed_by("output.explore.page", "min(max(REST, seconds), LONGEST_REST) if", "REST if")
+def test_a_slow_step_waits_for_a_longer_rest(visit):
+    """So that a fan of a second does not stop a drag that pauses for a moment."""
+
+    async def user(opened):
+        page = opened.page
+        page.learned |= {"fan": 0.4, "poles": math.inf, "loop curves": 7.0}
+        assert [page._rest_before(name) for name in ("fan", "poles", "loop curves", "box")] == [0.4, 0.15, 1.0, 0.15]
+
+    visit(user)
+
+
 @killed_by("output.explore.tuner", "        self.dialog.clear()\n", "", case="tune-ask-tuning")
 @killed_by("output.explore.saver", "        self.dialog.clear()\n", "", case="save-saving")
 @pytest.mark.parametrize(("button", "dialog"), [("tune", "ask-tuning"), ("save", "saving")])

@@ -30,6 +30,8 @@ SEAMS = {
     "bound_peaks": "diffabs.robust.frequency.peaks.bound_peaks",
     "solve_sdp": "diffabs.robust.design.sdp.solver.solve_sdp",
     "design": "diffabs.robust.design.synthesis.design",
+    "many_states": "diffabs.output.explore.members.MANY_STATES",
+    "in_kernel": "diffabs.output.explore.members._in_kernel",
     "members": "diffabs.output.explore.curves.MEMBERS",
     "identify": "diffabs.tune.identify.noise.identify",
     "max_cache_bytes": "diffabs.compiler.runtime.library_cache.MAX_CACHE_BYTES",

@@ -16,14 +16,15 @@ from diffabs.compiler.lower.indexing import MAX_COMPARED_ENTRIES
 from diffabs.compiler.lower.rules import Unsupported
 from diffabs.compiler.pipeline import run_lanes
 from diffabs.compiler.runtime.toolchain import NoCompiler
-from diffabs.core.compiling import is_traced
+from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once, is_traced
 from diffabs.core.log import log_rows
 from diffabs.core.pytree import prepare_derivatives
 from diffabs.core.tracing import differentiated_paths, jvp_nonzero, read_leaves
-from diffabs.core.types import Bool, Key, Params, PyTree, Scalar, Vector
+from diffabs.core.types import Bool, Int, Key, Params, PyTree, Scalar, Vector
 from diffabs.engine.drive.batches import STEPS_PER_EXCHANGE, EarlyEnd, sample_now, split_by_lane
 from diffabs.engine.drive.engine import check_process
-from diffabs.engine.drive.loops import STEPS_PER_BLOCK
+from diffabs.engine.drive.loops import STEPS_PER_BLOCK, run_with_trajectory
+from diffabs.engine.drive.runs import RunPlan, attach_trajectory
 from diffabs.engine.hybrid import Finish, HybridState, HybridSystem, Objectives
 from diffabs.engine.step.adaptive import AdaptiveStepping
 from diffabs.engine.step.event_location import RunStatus
@@ -164,6 +165,69 @@ def _run(
         replay=replay,
     )
     return jax.vmap(judge)(leaves, carry)
+
+
+def run_native_trajectories(
+    hybrid: HybridSystem,
+    values: Params,
+    keys: Key | None,
+    method: PyTree,
+    objectives: Objectives,
+    accepted: Vector,
+    plan: RunPlan,
+) -> PyTree:
+    """Return the result of `run_native`, for values only, with the trajectories that `plan` asks for.
+
+    Between two instants the kernel makes the steps of all runs; XLA observes them there. Runs wait for each other.
+    """
+    every, static = jax.device_put(plan.every), plan._replace(room=0, every=0)
+    return _run_observed(hybrid, values, objectives, method, keys, accepted, every, plan=static)
+
+
+@compile_once(static=("plan",), options=SAME_RESULT_OPTIONS)
+def _run_observed(
+    hybrid: HybridSystem,
+    values: Params,
+    objectives: Objectives,
+    method: PyTree,
+    keys: Key | None,
+    accepted: Vector,
+    every: Int,
+    *,
+    plan: RunPlan,
+) -> PyTree:
+    """Return the runs of `run_native_trajectories`."""
+    leaves, build_lane = split_by_lane(hybrid, values, objectives)
+    observe = plan.observe
+    assert observe is not None
+
+    def start(lane_leaves: PyTree, key: Key | None, accepted: Scalar) -> PyTree:
+        begins = method.start(*build_lane(lane_leaves), key)
+        return method.keep_steps(_stop_unaccepted(accepted, begins))
+
+    def advance_to(carry: PyTree, until: Int) -> PyTree:
+        return run_lanes(
+            lambda lane, carry: method.renew(build_lane(lane[0])[0], carry),
+            lambda lane, carry: method.step(*build_lane(lane[0]), lane[1], carry, until=until),
+            lambda _, carry: method.is_active(carry, until),
+            (leaves, keys),
+            carry,
+            steps=1,  # few steps lie between two instants
+            rounds=1,
+        )
+
+    def look(carry: PyTree, instant: Int) -> PyTree:
+        def observe_lane(lane_leaves: PyTree, carry: PyTree) -> PyTree:
+            return observe(build_lane(lane_leaves)[0], *method.state_at(carry, instant))
+
+        return jax.vmap(observe_lane)(leaves, carry)
+
+    carry = jax.vmap(start)(leaves, keys, accepted)
+    _check_logs(hybrid, carry.point.state)
+    first, count = look(carry, jnp.zeros_like(every)), -(-method.steps // every)
+    carry, later = run_with_trajectory(advance_to, look, carry, every, count, plan.instants)
+    judged = jax.vmap(lambda lane_leaves, carry: plan.finish(*build_lane(lane_leaves), carry))(leaves, carry)
+    return jax.vmap(attach_trajectory, in_axes=(0, 0, 1))(judged, first, later)
 
 
 def _check_logs(hybrid: HybridSystem, state: HybridState) -> None:

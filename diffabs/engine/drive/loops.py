@@ -56,9 +56,7 @@ def run_to_end(step: Step[MethodCarry], renew: Step[MethodCarry], carry: MethodC
 
 
 def run_with_trajectory(
-    step: Step[MethodCarry],
-    renew: Step[MethodCarry],
-    before: Callable[[MethodCarry, PyTree], PyTree],
+    advance_to: Callable[[MethodCarry, Int], MethodCarry],
     look: Callable[[MethodCarry, PyTree], PyTree],
     carry: MethodCarry,
     every: Int,
@@ -67,21 +65,40 @@ def run_with_trajectory(
 ) -> tuple[MethodCarry, PyTree]:
     """Return the carry after `count` times `every` steps of the grid, and a sample after each `every`-th step.
 
-    `before(carry, i)` is True if the run goes on and has not reached the grid instant i, and `look(carry, i)` is the
-    sample there. The samples have a leading axis of `room`; those beyond `count` are zero. Not for reverse mode.
+    `advance_to(carry, i)` goes to the grid instant i or to the end of the run, such as `step_until`, and
+    `look(carry, i)` is the sample there, with an attribute `running`. The samples have a leading axis of `room`. Those
+    beyond `count`, and those after the first in which no run goes on, are zero. Not for reverse mode.
     """
     samples = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), jax.eval_shape(look, carry, count))
 
-    def segment(i: Int, at: tuple[MethodCarry, PyTree]) -> tuple[MethodCarry, PyTree]:
+    def segment(at: tuple[Int, PyTree, MethodCarry, PyTree]) -> tuple[Int, PyTree, MethodCarry, PyTree]:
+        i, _, carry, samples = at
         until = (i + 1) * every
+        carry = advance_to(carry, until)
+        sample = look(carry, until)
+        samples = jax.tree.map(lambda all, x: all.at[i].set(x), samples, sample)
+        return i + 1, any_lane(jnp.any(sample.running)), carry, samples
 
-        def attempt(carry: MethodCarry) -> MethodCarry:
-            return step(renew(carry), until=until)
+    start = jnp.zeros_like(count), jnp.asarray(True), carry, samples
+    return jax.lax.while_loop(lambda at: at[1] & (at[0] < count), segment, start)[2:]
 
-        carry = jax.lax.while_loop(lambda carry: any_lane(before(carry, until)), attempt, at[0])
-        return carry, jax.tree.map(lambda all, x: all.at[i].set(x), at[1], look(carry, until))
 
-    return jax.lax.fori_loop(0, count, segment, (carry, samples))
+def step_until(
+    step: Step[MethodCarry],
+    renew: Step[MethodCarry],
+    before: Callable[[MethodCarry, PyTree], PyTree],
+    carry: MethodCarry,
+    until: Int,
+) -> MethodCarry:
+    """Return the carry at the grid instant `until`, or of a batch where every run is there. Not for reverse mode.
+
+    `before(carry, i)` is True if the run goes on and has not reached the instant i.
+    """
+
+    def attempt(carry: MethodCarry) -> MethodCarry:
+        return step(renew(carry), until=until)
+
+    return jax.lax.while_loop(lambda carry: any_lane(before(carry, until)), attempt, carry)
 
 
 def scan_with_trajectory(

@@ -30,6 +30,7 @@ from diffabs.engine.drive.loops import (
     run_with_trajectory,
     scan_steps,
     scan_with_trajectory,
+    step_until,
 )
 from diffabs.engine.hybrid import Finish, HybridSystem, Objectives, Observe
 from diffabs.engine.solvers import Adaptive, Solver
@@ -151,8 +152,9 @@ def _run(
         return plan.finish(hybrid, objectives, run_to_end(stepped, renew, carry))[0]
     look, count, carry = _observer(hybrid, method, plan), -(-method.steps // every), method.keep_steps(carry)
     first = look(carry, 0)
-    carry, trajectory = run_with_trajectory(stepped, renew, method.is_active, look, carry, every, count, instants)
-    return _attach_trajectory(plan.finish(hybrid, objectives, carry), first, trajectory)
+    advance_to = partial(step_until, stepped, renew, method.is_active)
+    carry, trajectory = run_with_trajectory(advance_to, look, carry, every, count, instants)
+    return attach_trajectory(plan.finish(hybrid, objectives, carry), first, trajectory)
 
 
 def _observer(hybrid: HybridSystem, method: PyTree, plan: RunPlan) -> Callable[[PyTree, Any], PyTree]:
@@ -182,7 +184,7 @@ def _run_reversible(hybrid: HybridSystem, objectives: Objectives, method: PyTree
     first = look(carry, 0)
     carry, trajectory = scan_with_trajectory(stepped, method.is_active, look, carry, every, count, instants, attempts)
     judged, slides = finish(hybrid, objectives, end_unfinished(carry)), has_slid(slide_of(carry))
-    return _attach_trajectory(judged, *void_derivatives((first, trajectory), slides, hybrid))
+    return attach_trajectory(judged, *void_derivatives((first, trajectory), slides, hybrid))
 
 
 def _run_by_replay(
@@ -222,7 +224,7 @@ def _run_by_replay(
     goes_on = instants < jax.lax.stop_gradient(again.point.t)
     first = observe(hybrid, start.point.t, start.point.state, jnp.asarray(True))
     trajectory = jax.vmap(partial(observe, hybrid))(instants, states, goes_on)
-    return _attach_trajectory(judged, *void_derivatives((first, trajectory), has_slid(slide_of(carry)), hybrid))
+    return attach_trajectory(judged, *void_derivatives((first, trajectory), has_slid(slide_of(carry)), hybrid))
 
 
 def _prepare_run(
@@ -234,7 +236,7 @@ def _prepare_run(
     return hybrid, objectives, partial(method.step, hybrid, objectives, key)
 
 
-def _attach_trajectory(judged: tuple[PyTree, PyTree], first: PyTree, later: PyTree) -> PyTree:
+def attach_trajectory(judged: tuple[PyTree, PyTree], first: PyTree, later: PyTree) -> PyTree:
     """Return the run with its trajectory: first and later instants, and the last one repeated after the end."""
     run, last = judged
 

@@ -8,15 +8,13 @@ import math
 import numpy as np
 
 from diffabs.core.types import JsonObject
-from diffabs.output.explore.panels import DISPLAY_ROUNDING, Curves, Fan, Panel
+from diffabs.output.explore.panels import AIMS, DISPLAY_ROUNDING, Curves, Fan, Panel
 from diffabs.output.explore.stability import Stability
 
 BLUE, RED, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#767676", "#1F2933"
 CURVE_COLOURS = (BLUE, RED, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
 CHART_DIGITS = 7  # significant digits of the numbers that go to the browser; a signal may move little, far from 0
 QUANTITIES = {"rad": "angle", "rad/s": "rate", "km/h": "speed", "N m": "torque", "V": "voltage"}
-# Signals that the loop should follow, with their dashes.
-AIMS = {"target": "dashed", "setpoint": "dotted", "command": "dashed"}
 OUTER, INNER = "5 to 95 % of the fan", "25 to 75 %"
 BEFORE = "before"
 FONT = "'Inter', 'Roboto', system-ui, sans-serif"
@@ -55,12 +53,12 @@ def change_curves(curves: Curves, dataset: str = "now") -> JsonObject:
     """Return the change of the chart that shows a run.
 
     Args:
-        dataset: "now" for the current run with all its curves, "before" for the first curve of each panel of a run to
-            compare with.
+        dataset: "now" for the current run with all its curves, "before" for the `compared` signals of a run to compare
+            with.
     """
     source = {"t": round_for_screen(curves.t)}
     for i, panel in enumerate(curves.panels):
-        lines = panel.lines if dataset == "now" else panel.lines[:1]
+        lines = panel.lines if dataset == "now" else panel.compared
         source |= {f"{i}.{j}": round_for_screen(line.values) for j, line in enumerate(lines)}
     change: JsonObject = {"dataset": [{"id": dataset, "source": source}]}
     if dataset == "now":
@@ -73,11 +71,11 @@ def change_fan(fan: Fan | None) -> JsonObject:
     if fan is None:
         return clear_curves("fan")
     source = {"t": round_for_screen(fan.t)}
-    for i, band in enumerate(fan.bands):
-        low, quarter, _, third, high = band
-        # Stacked areas: each entry is the distance to the quantile below.
-        steps = (low, quarter - low, third - quarter, high - third)
-        source |= {f"{i}.{j}": round_for_screen(values) for j, values in enumerate(steps)}
+    for i, bands in enumerate(fan.bands):
+        for k, (low, quarter, _, third, high) in enumerate(bands):
+            # Stacked areas: each entry is the distance to the quantile below.
+            steps = (low, quarter - low, third - quarter, high - third)
+            source |= {f"{i}.{k}.{j}": round_for_screen(values) for j, values in enumerate(steps)}
     return {"dataset": [{"id": "fan", "source": source}]}
 
 
@@ -216,18 +214,13 @@ def axis_label(panel: Panel) -> str:
 
 def _series(panel: Panel, i: int) -> list[JsonObject]:
     chart = {"type": "line", "xAxisIndex": i, "yAxisIndex": i, "showSymbol": False, "symbol": "none"}
-    # The lowest band of the stack is transparent; it lifts the others to the 5 % quantile.
-    hidden = {**chart, "datasetId": "fan", "stack": f"fan {i}", "stackStrategy": "all", "silent": True}
-    hidden |= {"lineStyle": {"width": 0}, "tooltip": {"show": False}, "z": 1}
-    names = ("", OUTER, INNER, OUTER)
-    shades = (0.0, 0.13, 0.26, 0.13)
-    series = [
-        {**hidden, "name": name or f"fan {i}", "encode": {"x": "t", "y": f"{i}.{j}"}}
-        | {"areaStyle": {"color": BLUE, "opacity": shade}, "itemStyle": {"color": "#8FBFDC" if j != 2 else "#5FA3CC"}}
-        for j, (name, shade) in enumerate(zip(names, shades, strict=True))
-    ]
-    before = {"lineStyle": {"color": GREY, "width": 1.5, "type": [6, 3]}, "itemStyle": {"color": GREY}, "z": 2}
-    series.append({**chart, "name": BEFORE, "datasetId": "before", "encode": {"x": "t", "y": f"{i}.0"}, **before})
+    series, several = [], len(panel.compared) > 1
+    for k in range(len(panel.compared)):
+        colour = CURVE_COLOURS[k % len(CURVE_COLOURS)]
+        series += _bands(chart, f"{i}.{k}", colour, light=several)
+        before = {"lineStyle": {"color": colour if several else GREY, "width": 1.5, "type": [6, 3]}, "z": 2}
+        before |= {"itemStyle": {"color": GREY}, "encode": {"x": "t", "y": f"{i}.{k}"}}
+        series.append({**chart, "name": BEFORE, "datasetId": "before", **before})
     signals = sum(line.name not in AIMS for line in panel.lines)
     followed = sum(line.name == panel.lines[-1].name for line in panel.lines)
     for j, line in enumerate(panel.lines):
@@ -242,6 +235,20 @@ def _series(panel: Panel, i: int) -> list[JsonObject]:
         look |= {"itemStyle": {"color": colour}, "z": 4 if j == 0 else 3}
         series.append({**chart, "name": line.name, "datasetId": "now", "encode": {"x": "t", "y": f"{i}.{j}"}, **look})
     return series
+
+
+def _bands(chart: JsonObject, place: str, colour: str, *, light: bool) -> list[JsonObject]:
+    """Return the areas of the fan of a signal, whose columns begin with `place`; `light` ones may overlap."""
+    # The lowest band of the stack is transparent; it lifts the others to the 5 % quantile.
+    hidden = {**chart, "datasetId": "fan", "stack": f"fan {place}", "stackStrategy": "all", "silent": True}
+    hidden |= {"lineStyle": {"width": 0}, "tooltip": {"show": False}, "z": 1}
+    names = ("", OUTER, INNER, OUTER)
+    shades = (0.0, 0.08, 0.16, 0.08) if light else (0.0, 0.13, 0.26, 0.13)
+    return [
+        {**hidden, "name": name or f"fan {place}", "encode": {"x": "t", "y": f"{place}.{j}"}}
+        | {"areaStyle": {"color": colour, "opacity": shade}, "itemStyle": {"color": "#8FBFDC" if j != 2 else "#5FA3CC"}}
+        for j, (name, shade) in enumerate(zip(names, shades, strict=True))
+    ]
 
 
 def _limits(panel: Panel) -> JsonObject:

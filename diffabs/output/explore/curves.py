@@ -13,14 +13,12 @@ from diffabs.core.units import control_units
 from diffabs.engine.solvers import Adaptive, FixedStep, Solver
 from diffabs.linear.robustness import low_discrepancy_points
 from diffabs.loop.admissible import batch_admissibility
-from diffabs.loop.batch import Batch
 from diffabs.loop.convert import trajectory_columns
-from diffabs.loop.ensemble import run_batch
 from diffabs.loop.faults import describe_faults
 from diffabs.loop.result import Run
-from diffabs.loop.run import rollout
 from diffabs.output.explore.friction import FACTOR_PATH
-from diffabs.output.explore.knobs import is_vehicle, mass_path
+from diffabs.output.explore.knobs import is_vehicle
+from diffabs.output.explore.members import run_alone, run_members, spread_paths, takes_kernel
 from diffabs.output.explore.panels import Curve, Curves, Fan, Panel, Spread
 from diffabs.output.explore.path import trace_path
 from diffabs.scenario.registry import KMH
@@ -29,6 +27,7 @@ from diffabs.scenario.scenario import Scenario
 INSTANTS = 400  # number of instants of a curve
 DRAFT_INSTANTS = 200  # number of instants of a fan, few because the browser lays all of them out with every redraw
 KEPT_MULTIPLE = 16  # a run that stops early must have enough instants: it keeps more, and is thinned afterwards
+KERNEL_MULTIPLE = 4  # the same for a run in a kernel, in which an instant costs more than a step
 MIN_DRAFT_STEPS = 4 * INSTANTS  # number of steps above which a draft is quicker
 DRAFT_RTOL = 1e-3  # relative error of a draft's step
 MEMBERS = 200  # number of runs of a fan
@@ -41,34 +40,39 @@ MIN_TRANSIENT_SHARE = 0.1  # a fan is drawn while this share of its runs goes on
 def drawing_solver(scenario: Scenario, instants: int = INSTANTS) -> Solver:
     """Return the scenario's solver, with `every` set for a run that may stop after a small part of its duration.
 
-    The step of the integration does not change. Over the whole duration, `KEPT_MULTIPLE` times `instants` are stored.
+    The step of the integration does not change. Over the whole duration, `KEPT_MULTIPLE` or `KERNEL_MULTIPLE` times
+    `instants` are stored.
     """
-    every = math.ceil(scenario.solver.steps / (KEPT_MULTIPLE * instants))
+    multiple = KERNEL_MULTIPLE if takes_kernel(scenario) else KEPT_MULTIPLE
+    every = math.ceil(scenario.solver.steps / (multiple * instants))
     return dataclasses.replace(scenario.solver, every=max(1, every))
 
 
 def thin(count: int, instants: int) -> np.ndarray:
     """Return the places of at most `instants` intervals among `count` instants, the first and the last included."""
-    places = np.arange(0, count, max(1, math.ceil((count - 1) / instants)))
-    return places if count == 0 or places[-1] == count - 1 else np.append(places, count - 1)
+    return np.unique(np.linspace(0, count - 1, min(count, instants + 1)).round().astype(int))
 
 
 def draft_solver(scenario: Scenario) -> Solver | None:
     """Return a quicker, adaptive solver for the curve during a drag, or None if the scenario's own is to be used.
 
-    The own solver stays if it is adaptive or has few steps. It also stays if a clock in the loop needs its grid.
+    The own solver stays if it is adaptive or has few steps, or if a kernel makes the runs. It also stays if a clock in
+    the loop needs its grid.
     """
     solver = scenario.solver
-    if scenario.loop.ticks or not isinstance(solver, FixedStep) or solver.steps <= MIN_DRAFT_STEPS:
+    if (
+        takes_kernel(scenario)
+        or scenario.loop.ticks
+        or not isinstance(solver, FixedStep)
+        or solver.steps <= MIN_DRAFT_STEPS
+    ):
         return None
     return Adaptive(rtol=DRAFT_RTOL, duration=solver.duration, step=solver.duration / (KEPT_MULTIPLE * INSTANTS))
 
 
 def run_curves(scenario: Scenario, by: Solver | None = None) -> Curves:
     """Return the curves of a scenario's run by a solver; None is the scenario's own."""
-    run: Run = jax.device_get(
-        rollout(scenario.loop, by or drawing_solver(scenario), scenario.objectives, key=scenario.key())
-    )
+    run = run_alone(scenario, by or drawing_solver(scenario))
     assert run.trajectory is not None
     # Samples after the end of the run are no part of the curves.
     count = len(trajectory_columns(run, scenario.loop.plant)["t"][1])
@@ -112,8 +116,7 @@ def run_fan(scenario: Scenario, spread: Spread) -> Fan | None:
         return None
     by = draft_solver(scenario) or drawing_solver(scenario, DRAFT_INSTANTS)
     accepted = batch_admissibility(scenario.loop, values, by).accepted
-    batch = Batch(values, keys=np.arange(MEMBERS) + scenario.seed)
-    run: Run = jax.device_get(run_batch(scenario.loop, batch, by, {}, trajectories=True, accepted=accepted))
+    run = run_members(scenario, values, by, accepted)
     # Samples after the end of a run, and diverged runs, are no part of the quantiles.
     lost = np.asarray(run.diverged)
     assert run.trajectory is not None
@@ -123,8 +126,10 @@ def run_fan(scenario: Scenario, spread: Spread) -> Fan | None:
     longest = int(np.argmax(going.sum(axis=1)))
     count = int(np.sum(going.mean(axis=0) >= MIN_TRANSIENT_SHARE * max(1e-9, going[:, 0].mean())))
     shown = thin(count, DRAFT_INSTANTS)
-    signals = [panel.lines[0].values for panel in _layout(run, scenario.loop.plant)]
-    bands = tuple(_quantiles(np.where(going, values, np.nan)[:, shown]) for values in signals)
+    bands = tuple(
+        tuple(_quantiles(np.where(going, line.values, np.nan)[:, shown]) for line in panel.compared)
+        for panel in _layout(run, scenario.loop.plant)
+    )
     refused = int(np.sum(~accepted))
     return Fan(t[longest, shown], bands, MEMBERS, refused, int(lost.sum()) - refused, words)
 
@@ -137,8 +142,8 @@ def fan_members(scenario: Scenario, spread: Spread) -> tuple[dict[str, np.ndarra
     remains.
     """
     specs = {path: spec for path, spec, _ in parameters(scenario.loop)}
-    spreads = {mass_path(scenario): spread.mass, FACTOR_PATH: spread.road}
-    spreads = {path: part for path, part in spreads.items() if path in specs and part > 0}
+    spreads = {path: spread.road if path == FACTOR_PATH else spread.mass for path in spread_paths(scenario)}
+    spreads = {path: part for path, part in spreads.items() if part > 0}
     unit = 2 * low_discrepancy_points(MEMBERS, len(spreads)) - 1
     values, words = {}, []
     for i, (path, part) in enumerate(spreads.items()):

@@ -29,6 +29,7 @@ from diffabs.scenario.scenario import Scenario
 
 QUICK_JOB_S = 0.05  # s; quicker computations are repeated during a drag
 REST = 0.15  # s without a change before all results are computed
+LONGEST_REST = 1.0  # s; a slow step waits for a rest of its own time, at most this, so that it hinders no drag
 PROVING = 0.35  # s without a change before a proof is attempted
 PREPARING = (
     "compiling and running this loop … A brake takes a few seconds, a car with four wheels up to a minute; after that, "
@@ -332,7 +333,7 @@ class Page:
             with self._report_error("run", version):
                 self._send(curves.run_curves(now), now, version)
         for name in steps:
-            if name not in quick and version == self.version:
+            if name not in quick and self._wait_for_rest(self._rest_before(name), version):
                 self._say(name, version)
                 self._time_step(name, steps[name], now, version)
         if version == self.version and not self.box_current:
@@ -343,6 +344,11 @@ class Page:
             self.later(self._show_verdict, _verdict(self.tools.prove, now), version)
         self._say("", version)
         objections(now)  # compiles the check now, before the next edit needs it
+
+    def _rest_before(self, name: str) -> float:
+        """Return the rest [s] after which a step is computed: its own time, between `REST` and `LONGEST_REST`."""
+        seconds = self.learned.get(name, REST)
+        return min(max(REST, seconds), LONGEST_REST) if math.isfinite(seconds) else REST
 
     def _say(self, name: str, version: int) -> None:
         """Show what the page waits for; an empty name says that it waits for nothing."""

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 NO_VALUE = "-"
+# Signals that the loop should follow, with their dashes.
+AIMS = {"target": "dashed", "setpoint": "dotted", "command": "dashed"}
 DISPLAY_ROUNDING = 1e-12  # smaller magnitudes are shown as 0
 
 
@@ -18,7 +20,7 @@ class Curve(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """Curves of one unit; the fan belongs to the first curve.
+    """Curves of one unit.
 
     Attributes:
         unit: Unit of all curves.
@@ -29,6 +31,11 @@ class Panel(NamedTuple):
     unit: str
     lines: tuple[Curve, ...]
     quantity: str = ""
+
+    @property
+    def compared(self) -> tuple[Curve, ...]:
+        """Signals that have a fan and a curve to compare with: all signals of one quantity, otherwise the first."""
+        return tuple(line for line in self.lines if line.name not in AIMS) if self.quantity else self.lines[:1]
 
 
 class Strip(NamedTuple):
@@ -92,7 +99,7 @@ class Fan(NamedTuple):
 
     Attributes:
         t: Instants [s].
-        bands: Quantiles of the first curve of each panel, shape (QUANTILES, instants).
+        bands: For each panel the quantiles of each of its `compared` signals, shape (QUANTILES, instants).
         members: Number of members.
         refused: Number of members that must not be run.
         diverged: Number of diverged runs.
@@ -100,7 +107,7 @@ class Fan(NamedTuple):
     """
 
     t: np.ndarray
-    bands: tuple[np.ndarray, ...]
+    bands: tuple[tuple[np.ndarray, ...], ...]
     members: int
     refused: int
     diverged: int
