@@ -7,7 +7,7 @@ sampled controller.
 
 Few runs of a batch need the eigenvalues of their matrices, because rho(A) <= |(D^-1 A D)^k|^(1/k) for every diagonal D
 and every k. With the D that balances the matrices of the first run, k = 1 is mostly enough. This costs less than the
-matrices themselves.
+matrices themselves. The size of the program does not depend on the number of runs.
 """
 
 import dataclasses
@@ -24,13 +24,15 @@ from diffabs.core.channels import outputs_like
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once
 from diffabs.core.protocols import Memory, Reference
 from diffabs.core.pytree import canonical_dtypes, part, pytree, replace
-from diffabs.core.tracing import split_batched
+from diffabs.core.tracing import used_inputs
 from diffabs.core.types import Part, PyTree, Scalar
 from diffabs.loop.closed_loop import Loop
 
 BOUND_SQUARINGS = 4  # k = 16: within 3 % of the spectral radius for the loops of the papers
-LANES_PER_CHUNK = 256  # runs whose matrices stay in a processor's cache
+LANES_PER_CHUNK = 256  # at most
+ENTRIES_PER_CHUNK = 1 << 19  # about; so many of all matrices of a chunk stay in a processor's cache
 MIN_ENTRYWISE_MATRICES = 1 << 17  # number of matrices of all runs from which on they are computed entry by entry
+MAX_ENTRYWISE_STATES = 12  # entry by entry, the program of a car (23 states) compiles for minutes
 BALANCING_ROUNDS = 30
 BOUND_SAFETY_FACTOR = 1.01  # covers the rounding of a bound in single precision
 RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 3.5 of the origin
@@ -113,27 +115,40 @@ def _lane_builder(loop: Part) -> Callable[[PyTree], Loop]:
 @partial(jax.jit, static_argnames="squarings")
 def _bounds(loop: object, values: object, *, squarings: int) -> jax.Array:
     """Return an upper bound on |lambda| of all modes for each run [1/s], shape (runs,); infinite if unknown."""
+    build = _lane_builder(loop)
+    drain = jax.vmap(lambda values: _drain_rate(build(values)))(values)
+    first = jax.tree.map(lambda x: x[0], values)
+    program = jax.make_jaxpr(lambda values: _jacobians_of(build(values)))(first)
+    (shape,) = program.out_avals
+    if not any(used_inputs(program.jaxpr)):  # the matrices of all runs are equal
+        values = jax.tree.map(lambda x: x[:1], values)
     count = len(jax.tree.leaves(values)[0])
+    number, states, _ = shape.shape
+    entrywise = not squarings and states <= MAX_ENTRYWISE_STATES and number * count >= MIN_ENTRYWISE_MATRICES
 
-    @jax.jit  # traced once, used three times
-    def matrices(values: object) -> jax.Array:
-        return jnp.reshape(jacobians := _jacobians_of(_lane_builder(loop)(values)), (-1, *jacobians.shape[-2:]))
+    def bound(balance: jax.Array, values: object) -> tuple[jax.Array, jax.Array]:
+        """Return the balance, and a bound for each run of a chunk."""
+        if entrywise:
+            matrices = jax.vmap(lambda values: _map_over_probes(_entries, build(values)))(values)
+            bounds = jax.vmap(_norm_bound, (0, None))
+        else:
+            matrices = jax.vmap(jax.extend.core.jaxpr_as_fun(program))(*jax.tree.leaves(values))[0]
+            bounds = jax.vmap(partial(_power_norm_bound, squarings=squarings), (0, None))
 
-    drain = jax.vmap(lambda values: _drain_rate(_lane_builder(loop)(values)))(values)
-    first_matrices = matrices(jax.tree.map(lambda x: x[0], values))
-    balance = _balance(first_matrices)
-    if not split_batched(matrices, values)[0]:  # the matrices of all runs are equal
-        return jnp.maximum(_power_norm_bound(first_matrices, balance, squarings), drain)
+        def balance_first_run() -> jax.Array:
+            first = jax.tree.map(lambda x: x[0], matrices)
+            return _balance(jnp.moveaxis(jnp.array(first), -1, 0) if entrywise else first)
+
+        # The first chunk sets the balance: to compute it before would put all matrices into the program twice.
+        balance = jax.lax.cond(balance[0, 0] > 0, lambda: balance, balance_first_run)
+        return balance, bounds(matrices, balance)
+
+    lanes = LANES_PER_CHUNK if entrywise else min(LANES_PER_CHUNK, -(-ENTRIES_PER_CHUNK // shape.size))
+    chunks = -(-count // (lanes := min(lanes, count)))
     # Whole chunks: a partial chunk would need a second program.
-    places = jnp.minimum(jnp.arange(-(-count // LANES_PER_CHUNK) * LANES_PER_CHUNK), count - 1)
-    filled = jax.tree.map(lambda x: x[places], values) if count > LANES_PER_CHUNK else values
-
-    def bound(values: object) -> jax.Array:
-        if squarings or len(first_matrices) * count < MIN_ENTRYWISE_MATRICES:
-            return _power_norm_bound(matrices(values), balance, squarings)
-        return _norm_bound(_map_over_probes(_entries, _lane_builder(loop)(values)), balance)
-
-    rates = jax.lax.map(bound, filled, batch_size=min(LANES_PER_CHUNK, count))[:count]
+    places = jnp.minimum(jnp.arange(chunks * lanes), count - 1).reshape(chunks, lanes)
+    unset = jnp.zeros(shape.shape[:-1], shape.dtype)
+    rates = jax.lax.scan(bound, unset, jax.tree.map(lambda x: x[places], values))[1].reshape(-1)[:count]
     return jnp.maximum(rates, drain)
 
 

@@ -215,7 +215,7 @@ class TestBeforeARun:
         "bound = 0.5 * jnp.max(jnp.minimum(rows, columns))",
     )
     def test_the_bound_of_many_lanes_is_that_of_few(self, monkeypatch):
-        """Of many it is worked out number by number; and no mode is faster."""
+        """Of many it is worked out in chunks, and number by number; and no mode is faster."""
         values = {"sensor.time_constant": np.array([1e-4, 3e-4, 1e-3]), "plant.mass": np.array([4.0, 5.0, 8.0])}
 
         def bounds():
@@ -224,6 +224,9 @@ class TestBeforeARun:
             return np.asarray(jax.jit(lambda values: bound(RIG, values, squarings=0))(values))
 
         few = bounds()
+        with monkeypatch.context() as chunks_of_one_run:
+            replace_seam(chunks_of_one_run, "entries_per_chunk", 1)
+            np.testing.assert_allclose(bounds(), few, rtol=1e-6)
         replace_seam(monkeypatch, "min_entrywise_matrices", 0)
         many = bounds()
         np.testing.assert_allclose(many, few, rtol=1e-6)
@@ -233,6 +236,17 @@ class TestBeforeARun:
         modes = np.abs(np.linalg.eigvals(stable_step._jacobians(loops))).max((1, 2))
         assert (modes <= many).all()
         assert (many < 3 * modes).all()
+
+    @killed_by("loop.stability", "states <= MAX_ENTRYWISE_STATES and ", "")
+    def test_the_program_of_many_cars_is_that_of_few(self):
+        """Entry by entry, the matrices of a car have a program that compiles for minutes."""
+        loop = d.Loop(plant=plants.Car(), **plants.Car().usual_parts())
+
+        def length(runs):
+            values = {"plant.mass": jax.ShapeDtypeStruct((runs,), jnp.float64)}
+            return len(stable_step._bounds.lower(loop, values, squarings=0).as_text().splitlines())
+
+        assert length(10_000) < 1.01 * length(2)
 
     def test_an_impossible_objective_is_refused(self):
         late = {"settled": objectives.SettlingTime(share=-0.1)}

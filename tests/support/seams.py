@@ -74,6 +74,7 @@ SEAMS = {
     "lanes_at_once": "diffabs.engine.drive.batches.LANES_AT_ONCE",
     "core_count": "diffabs.engine.drive.batches.core_count",
     "min_runs_per_core": "diffabs.engine.drive.batches.MIN_RUNS_PER_CORE",
+    "entries_per_chunk": "diffabs.loop.stability.ENTRIES_PER_CHUNK",
     "min_entrywise_matrices": "diffabs.loop.stability.MIN_ENTRYWISE_MATRICES",
     "timeout_seconds": "diffabs.uncertainty.sweep.cluster.TIMEOUT_SECONDS",
     "chunk_cores": "diffabs.uncertainty.sweep.engines.core_count",
