@@ -308,11 +308,12 @@ def _entries(loop: Loop) -> list[list[jax.Array]]:
         at = state.with_flow(tree.unflatten(z))
         return jax.tree.leaves(loop.flow(0.0, at, loop.signals(0.0, at)))
 
-    once = jax.extend.core.jaxpr_as_fun(jax.make_jaxpr(flow)(*leaves))
+    # The linear map skips what a state does not move. The values are computed once, not with each column.
+    push, at_rest = jax.linearize(flow, *leaves)[1], [jnp.zeros_like(leaf) for leaf in leaves]
     columns = []
     for number, leaf in enumerate(leaves):
-        moved = partial(lambda number, x: once(*leaves[:number], x, *leaves[number + 1 :]), number)
+        moved = partial(lambda number, x: push(*at_rest[:number], x, *at_rest[number + 1 :]), number)
         for at in np.ndindex(leaf.shape):
-            rates = jax.jvp(moved, (leaf,), (jnp.zeros_like(leaf).at[at].set(1.0),))[1]
+            rates = jax.jvp(moved, (at_rest[number],), (at_rest[number].at[at].set(1.0),))[1]
             columns.append([rate[i] for rate in rates for i in np.ndindex(rate.shape)])
     return [list(row) for row in zip(*columns, strict=True)]
