@@ -3,14 +3,21 @@
 The right wheels brake on wet asphalt, the left ones on dry. Each wheel has a PID on its slip, without anti-windup, and
 a filtered target; a driver holds the line of the start. Masses and speeds are drawn. A run lasts for 1.5 s (`NoStop`)
 and ends above 10 m/s; so no last, shorter step has to agree. The slip's least denominator is 10 m/s, which no such run
-meets: at rest 1 ms would not be stable. Steps are equal ones of the classical Runge-Kutta method. Distance, lateral
-position, yaw and speed at the end must agree to 1e-9 of their greatest values, or the benchmark fails. "Error of the
-step" is the difference from an eighth of the step, in the same measure.
+meets: at rest 1 ms would not be stable. Outputs are distance, lateral position, yaw and speed at the end. A difference
+or an error is the greatest one of an output, relative to its greatest value over the lanes; an error is the difference
+from the C++ in double precision with an eighth of the step.
+
+    fixed       equal steps of the classical Runge-Kutta method; ends must agree to 1e-9 in double precision, to 3e-5 in
+                single (rounding in 1,500 steps), or the benchmark fails. `run_batch` also checks the step for each
+                run; inside `jax.jit`, the second row, it does not
+    adaptive    Tsitouras' method on both sides, each with the loosest tolerance up to 1e-3 whose error is at most
+                1e-5. The kernel locates the limits of torques and locked wheels; the C++ has a PI control and rejects
+                steps across them. In both, every lane has its own steps
 
 peers/car.cpp is compiled by the compiler of the kernel, with its flags and again with those of peers/c.py. Times are
 processor times of all threads, taken in turn, without compilation; a ratio is the median of those within a round.
 
-    python benchmarks/bench_car.py [--lanes 4096] [--rounds 7] [--step 1e-3] [--threads 1]
+    python benchmarks/bench_car.py [--lanes 4096] [--rounds 7] [--step 1e-3] [--threads 1] [--float32] [--steps fixed]
 
 Beside them stand figures that H. M. Unjhawala and others print (doi:10.21105/joss.06548): other models, on an Intel
 i7-13700K, by a semi-implicit method with steps of 1 ms, one car at a time, accelerating. They are no measure of ours.
@@ -18,6 +25,7 @@ i7-13700K, by a semi-implicit method with steps of 1 ms, one car at a time, acce
 
 import argparse
 import ctypes
+import functools
 import os
 import pathlib
 import statistics
@@ -27,7 +35,7 @@ from typing import Any
 import jax
 import numpy as np
 import record
-from peers import c
+from peers import c, tableau
 from rich.console import Console
 from rich.table import Table
 
@@ -41,7 +49,9 @@ from diffabs.parts.objectives.tracking import FinalValue
 from diffabs.parts.plants import GRAVITY
 from diffabs.parts.plants.car import BRAKES, Car
 
-DURATION, AGREEMENT, CHECKED, FINER = 1.5, 1e-9, 64, 8
+DURATION, FINER, GOAL = 1.5, 8, 1e-5
+AGREEMENT = {"float64": 1e-9, "float32": 3e-5}  # of ends by equal steps
+LADDER = tuple(10.0**-k for k in np.arange(3.0, 8.1, 0.25))  # tolerances
 SPEEDS, MASSES = (28.0, 32.0), (1000.0, 1400.0)  # m/s, kg
 PID = controllers.PID(kp=1e4, ki=1.5e5, low=0.0, high=2000.0)
 TARGET = references.FilteredSlip(slip=0.1)
@@ -54,6 +64,7 @@ PARTS = {
     "stop": stops.NoStop(),
 }
 LOOP = d.Loop(plant=CAR, **{**CAR.usual_parts(), **PARTS})
+REALS = {"float64": "double", "float32": "float"}
 SOURCE = pathlib.Path(__file__).with_name("peers") / "car.cpp"
 PRINTED = {"11 degrees of freedom, two wheels": 1.5, "18 degrees of freedom, four wheels": 2.6}  # ms for 10 s
 
@@ -93,33 +104,43 @@ def constants():
 def drawn(lanes):
     """Return a mass [kg] and a speed [m/s] for each lane."""
     generator = np.random.default_rng(0)
-    return generator.uniform(*MASSES, lanes), generator.uniform(*SPEEDS, lanes)
+    return tuple(generator.uniform(*span, lanes).astype(np.float32).astype(float) for span in (MASSES, SPEEDS))
 
 
-def by_kernel(masses, speeds, step):
-    """Return the call that returns the four outputs at the end, shape (4, lanes)."""
-    batch = d.Batch({"plant.mass": masses, "initial.speed": speeds})
-    solver = d.FixedStep(step, DURATION, kinks=False)
+def by_kernel(masses, speeds, dtype, kind, setting, *, traced=False):
+    """Return the call that returns the four outputs at the end, shape (4, lanes). A traced call checks no step."""
+    solver = d.FixedStep(setting, DURATION, kinks=False) if kind == "fixed" else d.Adaptive(setting, DURATION)
+
+    def metrics(masses, speeds):
+        batch = d.Batch({"plant.mass": masses, "initial.speed": speeds})
+        return d.run_batch(LOOP, batch, solver, FINAL, engine="kernel").metrics
+
+    compiled = jax.jit(metrics) if traced else metrics
+    masses, speeds = masses.astype(dtype), speeds.astype(dtype)
 
     def call():
-        metrics = d.run_batch(LOOP, batch, solver, FINAL, engine="kernel").metrics
-        return np.stack([np.asarray(metrics[name]) for name in OUTPUTS])
+        with jax.enable_x64(dtype == "float64"):
+            ends = compiled(masses, speeds)
+            return np.stack([np.asarray(ends[name]) for name in OUTPUTS])
 
     return call
 
 
-def by_hand(masses, speeds, step, threads, flags=()):
+def by_hand(masses, speeds, dtype, kind, setting, threads, flags=()):
     """Return the call of peers/car.cpp that returns distance, lateral position, yaw and speed, shape (4, lanes)."""
-    lines = [f"#define {name} {text}" for name, text in constants().items()]
+    numbers = constants() | {name: repr(x) for name, x in tableau.definitions().items()}
+    lines = [f"#define {name} {text}" for name, text in {"REAL": REALS[dtype], **numbers}.items()]
     text = "\n".join([*lines, SOURCE.read_text(encoding="utf-8")])
+    flags = (*(flags or toolchain.CPP_FLAGS), *(("-fsingle-precision-constant",) if dtype == "float32" else ()))
     function = ctypes.CDLL(str(toolchain.build_library(text, flags))).run
-    array = np.ctypeslib.ndpointer(np.float64, flags="C")
-    function.argtypes = [ctypes.c_long, array, array, ctypes.c_long, ctypes.c_double, ctypes.c_int, array]
-    function.restype = None
-    end = np.empty((len(OUTPUTS), len(masses)))
+    array = np.ctypeslib.ndpointer(np.dtype(dtype), flags="C")
+    function.argtypes = [ctypes.c_long, array, array, ctypes.c_int, *[ctypes.c_double] * 2, ctypes.c_int, array]
+    function.restype = ctypes.c_long
+    masses, speeds = masses.astype(dtype), speeds.astype(dtype)
+    end = np.empty((len(OUTPUTS), len(masses)), dtype)
 
     def call():
-        function(len(masses), masses, speeds, round(DURATION / step), step, threads, end)
+        function(len(masses), masses, speeds, kind == "adaptive", DURATION, setting, threads, end)
         return end
 
     return call
@@ -137,33 +158,57 @@ def processor_time(call):
     return time.process_time() - begun
 
 
-def measured(lanes, step, rounds, threads):
-    """Return the error of the step, and a row for each program."""
-    masses, speeds = drawn(lanes)
+def makers(masses, speeds, dtype, kind, threads):
+    """Return by name what makes the call of a program for a setting: a step [s] or a tolerance."""
     best = tuple(flag for flag in c.FLAGS if flag not in ("-c", "-fopenmp"))
-    calls = {
-        "kernel": by_kernel(masses, speeds, step),
-        "C++, flags of the kernel": by_hand(masses, speeds, step, threads),
-        "C++, -O3 -ffast-math": by_hand(masses, speeds, step, threads, (*best, "-shared", "-std=c++17", "-pthread")),
+    common = masses, speeds, dtype, kind
+    return {
+        "kernel": functools.partial(by_kernel, *common),
+        **({"kernel in jit": functools.partial(by_kernel, *common, traced=True)} if kind == "fixed" else {}),
+        "C++, flags of the kernel": functools.partial(by_hand, *common, threads=threads),
+        "C++, -O3 -ffast-math": functools.partial(
+            by_hand, *common, threads=threads, flags=(*best, "-shared", "-std=c++17", "-pthread")
+        ),
     }
-    ends = {name: call().copy() for name, call in calls.items()}
-    few = masses[:CHECKED], speeds[:CHECKED]
-    finer = by_hand(*few, step / FINER, 1)()
-    times = record.in_turn({name: lambda call=call: processor_time(call) for name, call in calls.items()}, rounds)
+
+
+def accurate(make, settings, truth):
+    """Return the first setting whose ends have an error of at most `GOAL`, its call and its ends."""
+    for setting in settings:
+        call = make(setting=setting)
+        end = call().copy()
+        if len(settings) == 1 or difference(end, truth) <= GOAL:
+            return setting, call, end
+    raise SystemExit(f"no tolerance gives an error of {GOAL:g}")
+
+
+def measured(lanes, step, rounds, threads, dtype, kind):
+    """Return a row for each program."""
+    masses, speeds = drawn(lanes)
+    truth = makers(masses, speeds, "float64", "fixed", threads)["C++, -O3 -ffast-math"](setting=step / FINER)()
+    settings = (step,) if kind == "fixed" else LADDER
+    chosen = {
+        name: accurate(make, settings, truth) for name, make in makers(masses, speeds, dtype, kind, threads).items()
+    }
+    takers = {name: functools.partial(processor_time, call) for name, (_, call, _) in chosen.items()}
+    times = record.in_turn(takers, rounds)
     rows = {}
-    for name, end in ends.items():
-        apart = difference(end, ends["kernel"])
-        if not apart <= AGREEMENT:
-            raise SystemExit(f"{name}: the ends differ by {apart:.1e} from the kernel's, more than {AGREEMENT:g}")
+    for name, (setting, _, end) in chosen.items():
+        apart = difference(end, chosen["kernel"][2])
+        if kind == "fixed" and not apart <= AGREEMENT[dtype]:
+            raise SystemExit(
+                f"{name}: the ends differ by {apart:.1e} from the kernel's, more than {AGREEMENT[dtype]:g}"
+            )
         seconds = statistics.median(times[name]) / lanes
         rows[name] = {
+            "setting": setting,
+            "error": difference(end, truth),
             "difference": apart,
             "runs_per_s_and_core": 1 / seconds,
-            "ns_per_step": 1e9 * seconds * step / DURATION,
             "ms_per_10_s": 1e3 * seconds * 10.0 / DURATION,
             "speed_over_kernel": record.ratio(times["kernel"], times[name]),
         }
-    return {"error_of_step": difference(ends["kernel"][:, : len(few[0])], finer), "rows": rows}
+    return rows
 
 
 def main():
@@ -173,19 +218,30 @@ def main():
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--step", type=float, default=1e-3, help="s")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--float32", action="store_true", help="single precision on both sides")
+    parser.add_argument("--steps", nargs="+", choices=("fixed", "adaptive"), default=("fixed", "adaptive"))
     parser.add_argument("--out", type=pathlib.Path)
     options = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # a kernel has a thread for each processor that the process may use
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.threads])
     jax.config.update("jax_enable_x64", True)
+    dtype = "float32" if options.float32 else "float64"
     sizes = {key: getattr(options, key) for key in ("lanes", "step", "rounds", "threads")}
-    made = {**measured(**sizes), **sizes, "printed_ms_per_10_s": PRINTED, "kernel": toolchain.describe_compiler()}
-    table = Table("car", "runs/s and core", "ns/step", "ms for 10 s", "speed over kernel's", "difference")
-    for name, row in made["rows"].items():
-        numbers = (f"{row['ns_per_step']:,.0f}", f"{row['ms_per_10_s']:.2f}", f"{row['speed_over_kernel']:.2f}")
-        table.add_row(name, f"{row['runs_per_s_and_core']:,.0f}", *numbers, f"{row['difference']:.0e}")
-    Console().print(table, f"error of the step: {made['error_of_step']:.1e}; printed elsewhere, in ms: {PRINTED}")
-    Console().print(f"written to {record.written('car', made, options.out)}", soft_wrap=True)
+    rows = {kind: measured(**sizes, dtype=dtype, kind=kind) for kind in options.steps}
+    made = {"rows": rows, "dtype": dtype, **sizes, "printed_ms_per_10_s": PRINTED}
+    table = Table(f"car, {dtype}", "", "setting", "error", "difference", "runs/s and core", "ms for 10 s", "speed")
+    for kind, programs in rows.items():
+        for name, row in programs.items():
+            numbers = (f"{row['setting']:.1e}", f"{row['error']:.1e}", f"{row['difference']:.0e}")
+            speeds = (
+                f"{row['runs_per_s_and_core']:,.0f}",
+                f"{row['ms_per_10_s']:.2f}",
+                f"{row['speed_over_kernel']:.2f}",
+            )
+            table.add_row(kind, name, *numbers, *speeds)
+    Console(width=120).print(table, f"speed: over the kernel's; printed elsewhere, in ms: {PRINTED}")
+    path = record.written(f"car-{dtype}", {**made, "kernel": toolchain.describe_compiler()}, options.out)
+    Console().print(f"written to {path}", soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import record
-from peers import c
+from peers import c, tableau
 from rich.console import Console
 from rich.table import Table
 from scipy.integrate import solve_ivp
@@ -85,11 +85,7 @@ def by_diffabs(kind, rho, engine="kernel"):
 
 def compiled(real, flags):
     """Return `run` of peers/lorenz.cpp."""
-    tableau = diffrax.Tsit5.tableau
-    rows = [*tableau.a_lower]
-    numbers = {f"A{i + 2}{j + 1}": float(x) for i, row in enumerate(rows) for j, x in enumerate(row)}
-    numbers |= {f"E{i + 1}": float(x) for i, x in enumerate(tableau.b_error)}
-    lines = [f"#define REAL {real}", *(f"#define {name} REAL({x!r})" for name, x in numbers.items())]
+    lines = [f"#define REAL {real}", *(f"#define {name} REAL({x!r})" for name, x in tableau.definitions().items())]
     text = "\n".join([*lines, SOURCE.read_text(encoding="utf-8")])
     function = ctypes.CDLL(str(toolchain.build_library(text, flags))).run
     array = np.ctypeslib.ndpointer(np.float32 if real == "float" else np.float64, flags="C")

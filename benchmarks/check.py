@@ -5,11 +5,12 @@
     design           a program of ours over one written by hand in cvxpy
     peers            seconds of Adaptive over those of C, of diffrax, and of our fixed steps, all to 1e-4 on every lane
     work-precision   seconds of Adaptive over those of fixed steps on our own problems, both to 1e-4 on every lane
+    car              seconds of the kernel over those of C++ by hand on the car with four wheels, in float64
 
 The less the better, all of them. One line for each; exit status 1 if one is more than `--factor` times what is stored.
 A peer that is not installed is not compared. `--store` keeps what was found instead.
 
-    python benchmarks/check.py [gradient riccati design peers work-precision] [--store] [--records DIR]
+    python benchmarks/check.py [gradient riccati design peers work-precision car] [--store] [--records DIR]
 """
 
 import argparse
@@ -46,6 +47,7 @@ RUNS = {
         "slip-cured",
         "arm",
     ),
+    "car": ("--lanes", "1024", "--rounds", "3"),
 }
 ENVIRONMENTS = {"riccati": {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}}  # SciPy at its best
 
@@ -87,12 +89,21 @@ def work_precision(found: dict[str, Any]) -> Iterator[tuple[str, float]]:
             yield f"{name}: adaptive over fixed", best["adaptive"] / best["fixed"]
 
 
+def car(found: dict[str, Any]) -> Iterator[tuple[str, float]]:
+    """Yield name and value of each ratio."""
+    for kind, programs in found["rows"].items():
+        for name, row in programs.items():
+            if name.startswith("C++"):
+                yield f"{kind}: kernel over {name}", row["speed_over_kernel"]
+
+
 READERS: dict[str, Callable[[dict[str, Any]], Iterator[tuple[str, float]]]] = {
     "gradient": gradient,
     "riccati": riccati,
     "design": design,
     "peers": peers,
     "work-precision": work_precision,
+    "car": car,
 }
 
 

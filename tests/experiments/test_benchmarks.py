@@ -186,14 +186,35 @@ def test_the_yardsticks_agree(tmp_path, monkeypatch):
 def test_the_car_by_hand_is_the_car_of_our_parts(monkeypatch):
     """Kernel and C++ agree on every run; with another driver in the C++ the benchmark refuses to compare."""
     bench = module("bench_car")
-    taken = bench.measured(lanes=12, step=1e-3, rounds=1, threads=1)
-    assert len(taken["rows"]) == 3
-    assert all(row["difference"] < 1e-12 and row["runs_per_s_and_core"] > 0 for row in taken["rows"].values())
-    assert taken["error_of_step"] < 1e-7
+    fixed, adaptive = (
+        bench.measured(lanes=12, step=1e-3, rounds=1, threads=1, dtype="float64", kind=kind)
+        for kind in ("fixed", "adaptive")
+    )
+    assert len(fixed) == 4
+    assert all(row["difference"] < 1e-12 and row["runs_per_s_and_core"] > 0 for row in fixed.values())
+    assert all(row["error"] < 1e-7 for row in fixed.values())
+    assert len(adaptive) == 3
+    assert all(row["error"] <= bench.GOAL for row in adaptive.values())
     constants = bench.constants()
     monkeypatch.setattr(bench, "constants", lambda: constants | {"GAIN": "0.0301"})
     with pytest.raises(SystemExit, match=r"C\+\+, flags of the kernel: the ends differ by"):
-        bench.measured(lanes=12, step=1e-3, rounds=1, threads=1)
+        bench.measured(lanes=12, step=1e-3, rounds=1, threads=1, dtype="float64", kind="fixed")
+
+
+@pytest.mark.slow
+def test_the_car_by_hand_has_a_single_precision():
+    bench = module("bench_car")
+    ends = {
+        (dtype, kind): bench.by_hand(*bench.drawn(16), dtype, kind, setting, 1)()
+        for dtype in bench.REALS
+        for kind, setting in (("fixed", 1e-3), ("adaptive", 1e-6))
+    }
+    truth = ends["float64", "fixed"]
+    assert bench.difference(ends["float64", "adaptive"], truth) < 1e-6
+    for kind in ("fixed", "adaptive"):
+        single = ends["float32", kind]
+        assert single.dtype == np.float32
+        assert 1e-8 < bench.difference(single, truth) < bench.AGREEMENT["float32"]
 
 
 RECORD = {"loops": {"lmi": {"rows": {"forward 1": {"ratio": 2.0}, "reverse": {"ratio": 6.0}}}}}
