@@ -1,6 +1,7 @@
 /* Elementary functions of vectors, without branches, accurate to about one unit in the last place
    (tests/compiler/test_kernel_native.py). Polynomials are Taylor's, so that their coefficients can be checked by eye.
-   Only the inverse tangent and the logarithm in single precision have Chebyshev polynomials. */
+   Only the inverse tangent and the logarithm in single precision have Chebyshev polynomials. Functions in single
+   precision do not go by way of double: 16 doubles fill two registers, and compilers then compare lane by lane. */
 #pragma once
 #include "lanes.h"
 
@@ -68,6 +69,15 @@ FN vf64 k_expm1(vf64 x) {   /* (2^n - 1) + 2^n r, its rounding error `lost`, and
   const vf64 found = sum + (power*(r*r*tail_of_exp(r) + low) + lost);
   return sel(lt(all(50.0), x), k_exp(x) - 1.0, sel(ne(x, x) | eq(x, vf64{}), x, found)); }
 
+FN vf32 k_expm1(vf32 x) {
+  const vf32 y = lower(sel(lt(all(-50.f), x), x, all(-50.f)), all(50.f)), n = whole(y*1.44269504f);
+  const vf32 high = y - n*0x1.62e0p-1f, part = n*0x1.0bfbe8p-15f, r = high - part, low = (high - r) - part;
+  vf32 q = r*(1/5040.f) + 1/720.f;
+  q = q*r + 1/120.f; q = q*r + 1/24.f; q = q*r + 1/6.f; q = q*r + 0.5f;
+  const vf32 power = scaled(all(1.f), n), less = power - 1.f, sum = less + power*r, lost = (less - sum) + power*r;
+  const vf32 found = sum + (power*(r*r*q + low) + lost);
+  return sel(lt(all(50.f), x), k_exp(x) - 1.f, sel(ne(x, x) | eq(x, vf32{}), x, found)); }
+
 /* log(m 2^e) + error: m between 3/4 and 3/2, s = (m - 1)/(m + 1), log(m) = 2 (s + s^3/3 + s^5/5 ...) */
 FN vf64 series_of_log(vf64 z) {
   vf64 p = z*(2/25.0) + 2/23.0;
@@ -80,12 +90,12 @@ FN vf64 log_parts(vf64 m, vf64 e, vf64 error) {
   return e*0x1.62e42feep-1 - ((half - (s*(half + p) + (e*0x1.a39ef35793c76p-33 + error))) - f); }
 /* In single precision f - f^2/2 + f^3 p(f), f = m - 1: a division would cost more than the longer polynomial p. It is
    Chebyshev's, with an error of a seventh of a unit in the last place. */
-FN vf32 log_parts(vf32 m, vf32 e) {
+FN vf32 log_parts(vf32 m, vf32 e, vf32 error) {
   const vf32 f = m - 1.f, z = f*f;
   vf32 p = f*0.042871978f - 0.0956134f;
   p = p*f + 0.11680682f; p = p*f - 0.12639311f; p = p*f + 0.14268306f; p = p*f - 0.16660817f; p = p*f + 0.2000014f;
   p = p*f - 0.25000057f; p = p*f + 0.33333334f;
-  return e*0x1.62e0p-1f + (((f*z)*p + e*0x1.0bfbe8p-15f - 0.5f*z) + f); }
+  return e*0x1.62e0p-1f + (((f*z)*p + (e*0x1.0bfbe8p-15f + error) - 0.5f*z) + f); }
 /* For 0 and infinity `parted` gives m = 1 and an infinite n, so the logarithm is infinite too. */
 FN vf64 k_log(vf64 x) {
   vf64 e;
@@ -93,13 +103,18 @@ FN vf64 k_log(vf64 x) {
   return sel(le(vf64{}, x), found, all((f64)NAN)); }
 FN vf32 k_log(vf32 x) {
   vf32 e;
-  const vf32 m = parted(x, e), found = log_parts(m, e);
+  const vf32 m = parted(x, e), found = log_parts(m, e, vf32{});
   return sel(le(vf32{}, x), found, all((f32)NAN)); }
 FN vf64 k_log1p(vf64 x) {   /* the rounding error of 1 + x is corrected by the derivative, lost/u */
   const vf64 u = 1.0 + x, lost = sel(lt(x, all(1.0)), x - (u - 1.0), 1.0 - (u - x));
   vf64 e;
   const vf64 m = parted(u, e), found = log_parts(m, e, sel(lt(vf64{}, u) & finite(u), lost/u, vf64{}));
   return sel(eq(x, vf64{}), x, sel(le(vf64{}, u), found, all((f64)NAN))); }
+FN vf32 k_log1p(vf32 x) {
+  const vf32 u = 1.f + x, lost = sel(lt(x, all(1.f)), x - (u - 1.f), 1.f - (u - x));
+  vf32 e;
+  const vf32 m = parted(u, e), found = log_parts(m, e, sel(lt(vf32{}, u) & finite(u), lost/u, vf32{}));
+  return sel(eq(x, vf32{}), x, sel(le(vf32{}, u), found, all((f32)NAN))); }
 
 /* sine and cosine: x = n pi/2 + r; the C library computes large x */
 FN vf64 sin_series(vf64 r, vf64 low) {
@@ -159,9 +174,13 @@ FN vf64 k_tanh(vf64 x) {
   const vf64 y = lower(size(x), all(22.0)), t = k_expm1(2.0*y);
   const vf64 found = sel(lt(y, all(0.5)), t/(t + 2.0), 1.0 - 2.0/(t + 2.0));
   return sel(ne(x, x), x, (vf64)((vu64)found | ((vu64)x & 0x8000000000000000ull))); }
+FN vf32 k_tanh(vf32 x) {
+  const vf32 y = lower(size(x), all(10.f)), t = k_expm1(2.f*y);
+  const vf32 found = sel(lt(y, all(0.5f)), t/(t + 2.f), 1.f - 2.f/(t + 2.f));
+  return sel(ne(x, x), x, (vf32)((vu32)found | ((vu32)x & 0x80000000u))); }
 
 /* atan(x) = atan(c) + atan((x - c)/(1 + c x)) with c = 0, 1/2, 1, 3/2 or infinity: no quotient exceeds 7/16. There a
-   Chebyshev polynomial of the square has an error of 4e-18. */
+   Chebyshev polynomial of the square has an error of 4e-18, in single precision of 6e-9. */
 FN vf64 k_atan(vf64 x) {
   const vf64 y = size(x);
   vf64 top = y, bottom = all(1.0), high = vf64{}, low = vf64{};
@@ -180,10 +199,21 @@ FN vf64 k_atan(vf64 x) {
   p = p*z - 0.33333333333333332941;
   const vf64 found = high + (t + (p*z*t + low));
   return sel(ne(x, x), x, (vf64)((vu64)found | ((vu64)x & 0x8000000000000000ull))); }
-
-/* single precision, computed in double */
-#define WIDENED(f) FN vf32 f(vf32 x) { return CAST(vf32, f(CAST(vf64, x))); }
-WIDENED(k_expm1) WIDENED(k_log1p) WIDENED(k_tanh) WIDENED(k_atan)
+FN vf32 k_atan(vf32 x) {
+  const vf32 y = size(x);
+  vf32 top = y, bottom = all(1.f), high = vf32{}, low = vf32{};
+#define BEYOND(limit, a, b, h, l) { const mask m = lt(all(limit), y); \
+  top = sel(m, a, top); bottom = sel(m, b, bottom); high = sel(m, all(h), high); low = sel(m, all(l), low); }
+  BEYOND(7/16.f, y - 0.5f, 1.f + 0.5f*y, 0x1.dac670p-2f, 0x1.586ed4p-28f)
+  BEYOND(11/16.f, y - 1.f, y + 1.f, 0x1.921fb6p-1f, -0x1.777a5cp-26f)
+  BEYOND(19/16.f, y - 1.5f, 1.f + 1.5f*y, 0x1.f730bep-1f, -0x1.afc12cp-26f)
+  BEYOND(39/16.f, all(-1.f), y, 0x1.921fb6p+0f, -0x1.777a5cp-25f)
+#undef BEYOND
+  const vf32 t = top/bottom, z = t*t;
+  vf32 p = z*-0.062135886f + 0.10667636f;
+  p = p*z - 0.14256498f; p = p*z + 0.19999312f; p = p*z - 0.33333331f;
+  const vf32 found = high + (t + (p*z*t + low));
+  return sel(ne(x, x), x, (vf32)((vu32)found | ((vu32)x & 0x80000000u))); }
 
 /* rare functions, one lane after the other by the C library */
 ALONE(k_tan, tan) ALONE(k_asin, asin) ALONE(k_acos, acos) ALONE(k_sinh, sinh) ALONE(k_cosh, cosh)
