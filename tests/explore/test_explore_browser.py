@@ -115,7 +115,7 @@ CURVE = """() => { const box = document.querySelector('[data-id=curves] .nicegui
   const source = getElement(+box.id.slice(1)).chart.getOption().dataset[0].source; return source['0.0']; }"""
 BEFORE = CURVE.replace("dataset[0]", "dataset[1]")
 SPEED = CURVE.replace("'0.0'", "'1.0'")
-FAN = CURVE.replace("dataset[0]", "dataset[2]")
+FAN = CURVE.replace("dataset[0]", "dataset[2]").replace("'0.0'", "'0.0.0'")
 
 
 def drag(page, key: str, places: int, steps: int = 8) -> None:
