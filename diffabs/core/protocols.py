@@ -48,6 +48,7 @@ Optional methods or attributes of a part's class, beyond its contract:
                    probes(initial, setpoint, stop)      starts (k,) at which its loop may be stiffest
                    least_scales()                       sizes of states below which adaptive steps have absolute errors
                    frozen = ("speed", ...)              outputs that a linear model of its first output holds constant
+                   valid_magnitudes = {"yaw": 1.57}     greatest magnitudes of outputs for which the model holds
                    controls                             NamedTuple with `units` of several inputs, for `control_unit`
     output         highest                              greatest possible value of the first output
                    tracked = ("level_1", ...)           outputs that have a target, instead of the first one

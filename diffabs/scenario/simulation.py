@@ -17,8 +17,9 @@ from diffabs.loop.faults import describe_faults
 from diffabs.loop.result import Run
 from diffabs.loop.run import measure, rollout
 from diffabs.loop.sliding import describe_slide
-from diffabs.parts.objectives import at_limits
+from diffabs.parts.objectives import PeakOutput, at_limits
 from diffabs.scenario import model
+from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 
 AT_LIMIT = "at a limit\n"  # key among a run's objectives; the names in a scenario have no line break
@@ -43,7 +44,7 @@ class Simulation(NamedTuple):
     max_rows: int
 
     def warnings(self) -> Iterator[str]:
-        """Yield warnings: an unexpected end of the run, a metric never reached, a control mostly at a limit."""
+        """Yield warnings: unexpected ends, metrics never reached, outputs beyond the model, controls at limits."""
         scenario, run, stop = self.scenario, self.run, self.scenario.loop.stop
         stopped = bool(run.stopped)
         if bool(run.diverged):
@@ -59,6 +60,12 @@ class Simulation(NamedTuple):
                 yield f"{name} is infinite: the run ends before the event that it measures"
             elif math.isnan(run.metrics[name]):
                 yield f"{name} is not a number: the run lacks what it measures, as an overshoot needs a step"
+        valid = getattr(scenario.loop.plant, "valid_magnitudes", {})
+        for name, objective in scenario.objectives.items():
+            output = objective.output if isinstance(objective, PeakOutput) else ""
+            if run.metrics[name] > valid.get(output, math.inf):
+                limit = f"{valid[output]:.4g} {unit_of(objective, scenario.loop.plant)}"
+                yield f"{name} = {run.metrics[name]:.4g} is beyond {limit}, where the plant's model ends"
         if self.at_limit > WARNED_LIMIT_SHARE:
             limits, units = at_limits(scenario.loop), control_units(scenario.loop.plant)
             each = zip(units.items(), np.ravel(limits.low), np.ravel(limits.high), strict=True)

@@ -263,7 +263,8 @@ def _constraint_row(name: str, bound: float, before: float | None, after: float 
 def describe_clause(before: "Clause", after: "Clause") -> JsonObject:
     """Return the row of a clause; an undecided one has no figure, so that it does not count as met."""
     figures = (math.nan if clause.verdict == "undecided" else clause.figure for clause in (before, after))
-    return _constraint_row(f"{after.number} {after.rule}", after.limit, *figures, at_most=not after.at_least)
+    sense = f"{'at least' if after.at_least else 'at most'}{'' if after.unit == '1' else f', in {after.unit}'}"
+    return _constraint_row(f"{after.number} {after.rule} ({sense})", after.limit, *figures, at_most=not after.at_least)
 
 
 def _least_damping(task: "ProofTask", loop: Loop) -> float:

@@ -85,6 +85,16 @@ def test_four_wheels_get_half_of_their_axle_and_the_steer_angle_stays():
     np.testing.assert_allclose(command, (350.0, 350.0, 150.0, 150.0, 0.02), rtol=1e-12)
 
 
+def test_a_forgotten_brake_is_refused():
+    pedal = BrakeDistribution(
+        controlled="front_left_slip", front=("front_left_brake", "front_right_brake"), rear=("rear_left_brake",)
+    )
+    car = Car()
+    output = car.output(car.start(d.BrakeStart()))
+    with pytest.raises(ValueError, match=r"rear_right_brake .* is in neither list"):
+        pedal.start(Tracking(output, output, CarControls(0.0, 0.0, 0.0, 0.0, 0.0)))
+
+
 @pytest.mark.parametrize("more", [0.0, 0.05])
 def test_the_rear_axle_slips_as_the_balance_of_torques_says(more):
     """The ideal share gives both axles the slip of the front one; a greater share gives the rear axle less."""
@@ -124,6 +134,7 @@ def test_derivatives_of_the_distance_against_differences_of_three_widths():
         ({"front": ()}, "front = () is no list of names"),
         ({"rear": "rear_brake"}, "rear = 'rear_brake' is no list of names"),
         ({"rear": ("front_brake",)}, "front and rear have front_brake both"),
+        ({"front": ("front_brake", "front_brake")}, "front has front_brake twice"),
         ({"rear": ("back",)}, "there is no control back; there is front_brake, rear_brake"),
         ({"controlled": "slip"}, "there is no channel slip; there is front_slip, rear_slip"),
         ({"front_share": 1.5}, r"front_share = 1.5 is outside \[0, 1\]"),

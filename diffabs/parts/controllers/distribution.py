@@ -31,7 +31,7 @@ WHOLE = "controller"
 
 @pytree
 class BrakeDistribution(Parallel):
-    """One controller for all brakes; each axle gets a share of its command, and each brake of an axle the same.
+    """One controller for all brakes: each axle gets a share of its command, in equal parts for the brakes of the axle.
 
     See also:
         `controllers.PerChannel`: A controller for each brake.
@@ -78,6 +78,9 @@ class BrakeDistribution(Parallel):
         del name
         brakes = (*self.front, *self.rear)
         check_group("front, rear", brakes, signal.feedforward)
+        units = type(signal.feedforward).units
+        if unbraked := [name for name in units if name not in brakes and units[name] == units[brakes[0]]]:
+            raise ValueError(f"front, rear: {', '.join(unbraked)} [{units[brakes[0]]}] is in neither list")
         return Tracking(
             select_channel(signal.target, self.controlled),
             select_output(signal.measured, self.controlled),
@@ -104,5 +107,7 @@ class BrakeDistribution(Parallel):
             names = getattr(self, field)
             if isinstance(names, str) or not names:
                 yield f'{field} = {names!r} is no list of names; one is needed, such as ["{field}_brake"]'
+            elif repeated := sorted({name for name in names if names.count(name) > 1}):
+                yield f"{field} has {', '.join(repeated)} twice"
         if both := sorted({*self.front} & {*self.rear}):
             yield f"front and rear have {', '.join(both)} both; each control belongs to one axle"

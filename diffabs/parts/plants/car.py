@@ -22,6 +22,7 @@ Source: R. Rajamani, Vehicle Dynamics and Control, 2nd ed., sec. 8.3; the defaul
 Althoff and G. Wuersching, CommonRoad: Vehicle Models, 2020, with half of its axle's inertia for each wheel.
 """
 
+import math
 from collections import namedtuple
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -267,6 +268,7 @@ class Car(SlipProbes):
     """Pads and discs of all wheels."""
 
     controls = CarControls
+    valid_magnitudes: ClassVar[Mapping[str, float]] = MappingProxyType({"yaw": math.pi / 2})
 
     @property
     def shows(self) -> type[Any]:
