@@ -28,6 +28,15 @@ class Below(NoStop):
 
 
 @pytree
+class Bent(Below):
+    """The same, by a margin that falls fifty times as fast before its zero as beyond."""
+
+    def margin(self, output):
+        excess = output.slip - self.level
+        return jnp.where(excess > 0, 50.0 * excess, excess)
+
+
+@pytree
 class Slips:
     """From 2 to 5, where a margin that hardly falls goes through zero at last: a level less exp((t - end)/rise)."""
 
@@ -119,3 +128,18 @@ def test_derivatives_of_a_moment_are_those_at_the_zero(derivative):
         moves = 1e-4 * np.diag(at)
         expected = [(moment(at + move) - moment(at - move)) / 2e-4 for move in moves]
         close(derivative(moment)(at) * at, expected, rtol=2e-6)
+
+
+@killed_by("engine.step.event_location", "jnp.where(old.margin > 0, -overshoot, overshoot)", "0.0")
+@pytest.mark.parametrize("derivative", cases([jax.jacfwd, jax.jacrev], jax.jacfwd))
+def test_a_margin_that_bends_at_its_zero_has_one_moment(derivative):
+    """x' = -k x comes down to a level, at t = ln(1/level)/k. Rounding puts the end of a step on either side of the
+    bend, and fifteen moments within a step lie on both."""
+
+    def moment(k):
+        there = replace(loop(Proportional(k=k), Direct(), Integrator(), 1.0), {"stop": Bent(level=0.3)})
+        return d.measure(there, d.FixedStep(H, 0.1, kinks=False), {}).ending.sample.t
+
+    k = np.linspace(20.0, 20.3, 15)
+    slopes = jax.jit(jax.vmap(derivative(moment)))(k)
+    close(slopes, np.log(0.3) / k**2, rtol=1e-8)

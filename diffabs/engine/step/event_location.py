@@ -17,8 +17,8 @@ a later correction.
     land    the final step has the length place - margin(place)/slope, at least 0, and goes slightly beyond the surface
             of a comparison. Its derivative is that of the event's time by the implicit function theorem: the margin at
             the end of an attempt carries the derivative
-    refine  for second derivatives: one more attempt of the located length. The margin at its end gives one more Newton
-            step, which doubles the order of the derivative
+    refine  for derivatives with fixed steps: one more attempt of the located length. The margin at its end gives one
+            more Newton step, which doubles the order of the derivative
     refresh a step of length 0 evaluates the rates after an event, or within the mode beyond a switching surface. In a
             loop with a clock the rates are evaluated after every step, and no step of length 0 is needed
 
@@ -64,7 +64,7 @@ class RunStatus(enum.IntEnum):
         RUNNING: The next attempt is an ordinary step.
         SEEKING: Attempts shrink a bracket around an event.
         PROBING: The attempt measures how the margin falls near the event.
-        REFINING: The attempt provides second derivatives of the event's time.
+        REFINING: The attempt refines the derivatives of the event's time, and provides second ones.
         LANDING: The attempt ends on the event.
         REFRESHING: A step of length 0 evaluates the rates after the event, or beyond the switching surface.
         STOPPED: The run is over and has reached its stop.
@@ -242,13 +242,18 @@ def continue_search(
     search, next, near = _bracket_event(old, length, status == RunStatus.RUNNING, crossings, base)
     seeking = SearchPlan(search, next, jnp.where(near, RunStatus.PROBING, RunStatus.SEEKING))
     # A step ends sqrt(eps) steps beyond a switching surface, so that the comparison has surely changed there.
-    beyond = jnp.where(old.number < bit_count, base * jnp.finfo(base.dtype).eps ** OVERSHOOT_EXPONENT, 0.0)
+    overshoot = base * jnp.finfo(base.dtype).eps ** OVERSHOOT_EXPONENT
+    is_surface = old.number < bit_count
+    # A comparison may bend the margin of an event at its very zero. So the refining attempt ends as far aside, on the
+    # side of the place, whose slope the search has.
+    aside = jnp.where(is_surface | (not refines), 0.0, jnp.where(old.margin > 0, -overshoot, overshoot))
+    beyond = jnp.where(is_surface, overshoot, aside)
     search, landing = _locate_event(old, length, crossings)
     next, missed = _accept_location(search, length, landing, beyond)
     located = jnp.where(missed, RunStatus.SEEKING, RunStatus.REFINING if refines else RunStatus.LANDING)
     next_plan = select(status == RunStatus.PROBING, SearchPlan(search, next, located), seeking)
     if refines:
-        refined = SearchPlan(old, refine(old, length, crossings), status * 0 + RunStatus.LANDING)
+        refined = SearchPlan(old, refine(old, length, aside, crossings), status * 0 + RunStatus.LANDING)
         next_plan = select(status == RunStatus.REFINING, refined, next_plan)
     return next_plan._replace(status=next_plan.status.astype(status.dtype))
 
@@ -338,16 +343,22 @@ def _locate_event(search: EventSearch, x: Scalar, crossings: AttemptCrossings) -
     has_tangent &= ~search.at_once | steep
     # For an event at the beginning of the step the length is clipped at 0 in value, but not in its derivative.
     at_once = jnp.where(steep, moved - jax.lax.stop_gradient(jnp.minimum(moved, 0.0)), 0.0)
+    # The slope has the derivatives of that between place and probe, and of the length.
+    moves = jnp.where(has_tangent, ratio(probe.end - search.margin, x - place) + 2.0 * bend * moved, 0.0)
+    slope += moves - jax.lax.stop_gradient(moves)
     return search._replace(fall=jnp.where(has_tangent, slope, 0.0)), jnp.where(search.at_once, at_once, moved)
 
 
-def refine(search: EventSearch, x: Scalar, crossings: AttemptCrossings) -> Scalar:
-    """Return x, the length of the step that ends on the event [s], with the second derivatives of the event's time.
+def refine(search: EventSearch, x: Scalar, aside: Scalar, crossings: AttemptCrossings) -> Scalar:
+    """Return the length of the step that ends on the event [s], with the second derivatives of the event's time.
 
-    The value is unchanged. The derivatives come from a Newton step on the margin at the end of an attempt of length x.
+    The value is x less `aside`, the lengths [s] of an attempt and of its end beyond the event. The derivatives come
+    from a Newton step on the margin there.
     """
-    remaining = jnp.where((search.fall < 0) & jnp.isfinite(crossings.sought.end), crossings.sought.end, 0.0)
-    return x - (remaining - jax.lax.stop_gradient(remaining)) / jnp.where(search.fall < 0, search.fall, -1.0)
+    has_tangent = (search.fall < 0) & jnp.isfinite(crossings.sought.end)
+    remaining = jnp.where(has_tangent, crossings.sought.end - aside * search.fall, 0.0)
+    fall = jnp.where(search.fall < 0, jax.lax.stop_gradient(search.fall), -1.0)
+    return x - aside - (remaining - jax.lax.stop_gradient(remaining)) / fall
 
 
 def _accept_location(search: EventSearch, x: Scalar, length: Scalar, beyond: Scalar) -> tuple[PyTree, PyTree]:
