@@ -95,6 +95,15 @@ REDUCTION_OPERATIONS: dict[str, str] = {"sum": "add", "prod": "mul"}
 NEUTRAL_ELEMENTS: dict[str, int] = {"sum": 0, "prod": 1, "and": True, "or": False}
 
 
+def _neutral_element(kind: str, dtype: np.dtype) -> Any:
+    """Return the result of a reduction of nothing."""
+    if kind not in ("max", "min"):
+        return NEUTRAL_ELEMENTS[kind]
+    if np.issubdtype(dtype, np.floating):
+        return np.inf if kind == "min" else -np.inf
+    return np.iinfo(dtype).max if kind == "min" else np.iinfo(dtype).min
+
+
 @lowering_rule("reduce_sum", "axes out_sharding")
 @lowering_rule("reduce_prod", "axes out_sharding")
 @lowering_rule("reduce_max", "axes out_sharding")
@@ -111,9 +120,8 @@ def _reduce(graph: Graph, eqn: Equation, ins: list[NodeArray]) -> list[NodeArray
     for axis in sorted(eqn.params["axes"], reverse=True):
         rows = list(np.moveaxis(x, axis, 0))
         if not rows:
-            if kind not in NEUTRAL_ELEMENTS:
-                raise Unsupported(eqn.primitive.name, "of nothing")
-            nothing = np.full(np.delete(x.shape, axis), NEUTRAL_ELEMENTS[kind], eqn.outvars[0].aval.dtype)
+            dtype = eqn.outvars[0].aval.dtype
+            nothing = np.full(np.delete(x.shape, axis), _neutral_element(kind, dtype), dtype)
             rows = [constant_array(graph, nothing)]
         while len(rows) > 1:
             pairs = [map_entries(join, *rows[i : i + 2]) for i in range(0, len(rows) - 1, 2)]
